@@ -1,0 +1,1 @@
+"""The strict glTF 2.0 reader."""
