@@ -1,0 +1,95 @@
+"""How a person sees a running bake: one redrawn line on a terminal, a plain line every few seconds elsewhere."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from typing import TextIO
+
+from bake_core.progress import Progress
+
+# A terminal line redrawn faster than this only flickers; a log needs a line no oftener than this to show that work goes on.
+TERMINAL_INTERVAL = 0.1
+LOG_INTERVAL = 5.0
+BAR_WIDTH = 24
+
+
+class ProgressLine:
+    """Renders :class:`Progress` on a stream; pass it wherever a progress callback is taken, then call :meth:`close`.
+
+    Parameters
+    ----------
+    stream : TextIO, optional
+        Default stderr, so that stdout stays free for a command's answer.
+    label : str
+        Stands before each line; a job's id, for example.
+    """
+
+    def __init__(self, stream: TextIO | None = None, label: str = "") -> None:
+        self.stream = sys.stderr if stream is None else stream
+        self.label = f"{label} " if label else ""
+        self.terminal = self.stream.isatty()
+        self.last: Progress | None = None
+        self._drawn_at = float("-inf")
+        self._drawn: Progress | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Take one report; draws it if enough time has passed or something other than the fraction has changed."""
+        before, self.last = self._drawn, progress
+        # A new error figure or stage is news at once; a growing fraction is news only now and then.
+        news = before is None or (before.stage, before.samples) != (progress.stage, progress.samples)
+        interval = TERMINAL_INTERVAL if self.terminal else LOG_INTERVAL
+        if news or time.monotonic() - self._drawn_at >= interval:
+            self._draw(progress)
+
+    def close(self) -> None:
+        """Draw the last report if it was held back, and end the line."""
+        if self.last is not None and self.last != self._drawn:
+            self._draw(self.last)
+        if self.terminal and self._drawn is not None:
+            self.stream.write("\n")
+            self.stream.flush()
+
+    def _draw(self, progress: Progress) -> None:
+        self._drawn, self._drawn_at = progress, time.monotonic()
+        text = self.label + describe(progress)
+        if self.terminal:
+            filled = round(progress.fraction * BAR_WIDTH)
+            bar = "█" * filled + "░" * (BAR_WIDTH - filled)
+            width = shutil.get_terminal_size().columns
+            # Cut to the terminal's width: a line that wraps cannot be redrawn in place.
+            self.stream.write("\r" + f"{bar} {text}"[: width - 1] + "\x1b[K")
+        else:
+            self.stream.write(text + "\n")
+        self.stream.flush()
+
+
+def describe(progress: Progress) -> str:
+    """One report in words: ``tracing 42 %, 64 samples, error 3.1 %, 12 s, 8 s to go``."""
+    parts = [f"{progress.stage} {progress.fraction * 100:3.0f} %"]
+    if progress.samples:
+        parts.append(f"{progress.samples} samples")
+    if progress.error is not None:
+        parts.append(f"error {percent(progress.error)}")
+    parts.append(duration(progress.seconds))
+    if progress.eta is not None:
+        parts.append(f"{duration(progress.eta)} to go")
+    return ", ".join(parts)
+
+
+def percent(error: float) -> str:
+    """An error as a percentage with two significant digits, since its own uncertainty is of that order."""
+    return f"{error * 100:.2g} %"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people say them: ``3.2 s``, ``41 s``, ``5 min 07 s``, ``2 h 03 min``."""
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
