@@ -1,0 +1,56 @@
+# The verbs of this repository; `make` alone lists them.
+PYTHON ?= python3
+BIN := .venv/bin
+LOCKS := requirements.txt requirements-dev.txt
+PROJECTS := pyproject.toml clients/python/pyproject.toml
+
+.PHONY: help setup system-packages demo check test test-slow lock clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make setup       what octobake needs: Debian packages that are missing, Python packages in .venv, .venv/bin/octobake"
+	@echo "make demo        setup; then serve, upload, bake and verify a Cornell box: pictures and figures in out/demo"
+	@echo "make test        setup; then every test but the slow ones (ARGS=... goes to pytest)"
+	@echo "make test-slow   setup; then the tests that take minutes"
+	@echo "make check       setup; then lint, format, types, import layers, shaders for both targets"
+	@echo "make lock        choose package versions anew, and write them with their hashes to $(LOCKS)"
+	@echo "make clean       remove .venv and everything generated"
+
+setup: $(BIN)/.installed
+
+system-packages:
+	@PYTHON=$(PYTHON) .ci/system-packages
+
+# Hashes for every package, wheels only: nothing is fetched that is not pinned, build tools included. The stamp makes a second setup quick.
+$(BIN)/.installed: $(LOCKS) $(PROJECTS) | system-packages
+	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit(f"setup: Python 3.11 or newer is needed and $(PYTHON) is {v[0]}.{v[1]}; name another with: make setup PYTHON=...")'
+	@echo "setup: Python packages into .venv"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: --require-hashes $(LOCKS:%=-r %)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation -e . -e clients/python
+	@touch $@
+
+demo: setup
+	$(BIN)/octobake demo -o out/demo
+
+test: setup
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy bake_core service clients tests
+	$(BIN)/lint-imports
+	$(BIN)/python tests/compile_shaders.py
+
+UV_COMPILE := $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
+lock: setup
+	$(UV_COMPILE) $(PROJECTS) -o requirements.txt
+	$(UV_COMPILE) --group dev -c requirements.txt -o requirements-dev.txt
+
+clean:
+	rm -rf .venv out build .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
