@@ -1,0 +1,32 @@
+"""What every test shares: where outside scenes lie, and that nothing is left running."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from bake_core.kernel_cache import use_kernel_cache
+
+# Before any test module declares a kernel, and for every process that a test starts.
+use_kernel_cache()
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of scenes and specs that is handed out beside a checkout and is no part of it."""
+    folder = Path(__file__).resolve().parents[2] / "shared"
+    if not (folder / "scenes").is_dir():
+        pytest.skip("no shared/ folder beside this checkout: its scenes are not ours to ship")
+    return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_left_running() -> Iterator[None]:
+    """Every process that a test starts ends with it."""
+    yield
+    # multiprocessing's resource tracker belongs to Python, and ends with the process that it watches.
+    left = [p for p in psutil.Process().children(recursive=True) if "resource_tracker" not in " ".join(p.cmdline())]
+    assert not left, f"tests left processes running: {left}"
