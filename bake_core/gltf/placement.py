@@ -84,7 +84,9 @@ def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], no
         transform[mine, :, 3] += transform[mine, :, :3] @ centre
 
     bounds = np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)]) if boxes else np.zeros((2, 3))
-    origin: F64 = bounds.mean(axis=0)
+    # Adding 0 turns -0 into 0: these two are read by people.
+    bounds = bounds + 0.0
+    origin: F64 = bounds.mean(axis=0) + 0.0
     transform[:, :, 3] -= origin
     everything = [_moved(turned, world - origin) for world, turned in baked] + centred
     first_vertex = np.cumsum([0] + [len(m.positions) for m in everything])

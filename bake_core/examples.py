@@ -1,0 +1,163 @@
+"""Scenes of our own: the demo's, and those whose answer is known in closed form. Each function gives (GLB bytes, spec).
+
+Corners are put at short decimals or exact fractions, so that the closed forms hold for the float32 scene too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.gltf.writer import GlbWriter, Part, look_at
+
+Vec3 = Sequence[float]
+Example = tuple[bytes, dict[str, Any]]
+Corners = NDArray[np.float64]
+
+_QUAD = np.array([[0, 1, 2], [0, 2, 3]])
+# The sides of a box as corner numbers x + 2y + 4z, counter-clockwise as seen from inside: -x, +x, -y, +y, -z, +z.
+_SIDES = ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5))
+
+
+def _box(low: Vec3, high: Vec3) -> list[Corners]:
+    """The six sides of a box, facing inwards, in the order -x, +x, -y, +y, -z, +z."""
+    corner = np.array([[(low, high)[i >> a & 1][a] for a in range(3)] for i in range(8)], np.float64)
+    return [corner[list(side)] for side in _SIDES]
+
+
+def _part(quads: Sequence[Corners], material: int, *, outwards: bool = False) -> Part:
+    """Quads as one primitive, turned round where they shall face outwards."""
+    quads = [q[::-1] if outwards else q for q in quads]
+    indices = np.concatenate([_QUAD + 4 * i for i in range(len(quads))])
+    return Part(np.concatenate(quads), indices, material=material)
+
+
+def _horizontal(x: Vec3, z: Vec3, y: float, *, up: bool) -> Corners:
+    """A horizontal rectangle over x[0]..x[1], z[0]..z[1], facing up or down."""
+    quad = np.array([[x[0], y, z[0]], [x[0], y, z[1]], [x[1], y, z[1]], [x[1], y, z[0]]], np.float64)
+    return quad if up else quad[::-1]
+
+
+def cornell() -> Example:
+    """A Cornell box: a room of 2 × 2 × 2 m, open in front (+z), two boxes, a lamp in the ceiling, and a sun that comes in at the front.
+
+    Walls are single-sided and face inwards. Both boxes are one mesh, used twice. The turns are by 3-4-5 triangles, so that the bytes
+    do not hang on a mathematics library. The 6 × 6 × 6 probes span the room up to 5 cm from its walls.
+    """
+    w = GlbWriter()
+    white = w.material("white", (0.76, 0.75, 0.72))
+    left = w.material("terracotta", (0.65, 0.13, 0.06))
+    right = w.material("teal", (0.05, 0.32, 0.38))
+    blocks = w.material("blocks", (0.74, 0.70, 0.60))
+    lamp = w.material("lamp", (0.78, 0.78, 0.78), emission=(9.0, 7.2, 4.8))
+    sides = _box((-1, 0, -1), (1, 2, 1))
+    # The lamp hangs 1 cm below the ceiling: two surfaces in one plane would have no order.
+    glow = _horizontal((-0.35, 0.35), (-0.3, 0.3), 1.99, up=False)
+    room = w.mesh("room", [_part([sides[2], sides[3], sides[4]], white), _part([sides[0]], left), _part([sides[1]], right), _part([glow], lamp)])
+    # A block stands on the floor and has no bottom.
+    faces = _box((-0.5, 0, -0.5), (0.5, 1, 0.5))
+    block = w.mesh("block", [_part([f for i, f in enumerate(faces) if i != 2], blocks, outwards=True)])
+    w.node("room", mesh=room)
+    w.node("tall block", mesh=block, matrix=_turned((0.58, 1.2, 0.58), (0.96, 0.28), (-0.36, 0, -0.36)))
+    w.node("short block", mesh=block, matrix=_turned((0.56, 0.56, 0.56), (0.936, -0.352), (0.38, 0, 0.32)))
+    sun = w.light("directional", (1.0, 0.92, 0.78), 7.0)
+    w.node("sun", light=sun, matrix=look_at((0.9, 1.5, 2.0), (0, 0, 0)))
+    w.node("front", camera=w.camera(math.radians(56)), matrix=look_at((0.0, 1.02, 0.98), (0.0, 0.92, -1.0)))
+    w.node("corner", camera=w.camera(math.radians(62)), matrix=look_at((-0.9, 1.55, 0.92), (0.35, 0.6, -0.5)))
+    grid = {"name": "room", "origin": [-0.95, 0.05, -0.95], "spacing": [0.38, 0.38, 0.38], "counts": [6, 6, 6]}
+    return w.to_glb(), {"version": 1, "volumes": [grid]}
+
+
+def _turned(size: Vec3, turn: tuple[float, float], position: Vec3) -> NDArray[np.float64]:
+    """Scale, then turn about +y by the angle whose cosine and sine are `turn`, then move."""
+    cosine, sine = turn
+    rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.asarray(size)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def closed_box(albedo: float, emission: float, max_bounces: int | None = None) -> Example:
+    """A furnace: a sealed box of 2 × 2 × 2 m, all of whose walls have this albedo and emit this radiance, with 2 × 2 × 2 probes.
+
+    Every texel of every probe has irradiance π·Le/(1−a); with `max_bounces` k, times (1−a^(k+1)).
+    """
+    w = GlbWriter()
+    wall = w.material("wall", (albedo,) * 3, emission=(emission,) * 3)
+    w.node("box", mesh=w.mesh("box", [_part(_box((-1, -1, -1), (1, 1, 1)), wall)]))
+    # Off the box's symmetries, so that no two probes see the same.
+    grid = {"name": "box", "origin": [-0.55, -0.45, -0.6], "spacing": [1.0, 1.0, 1.0], "counts": [2, 2, 2]}
+    stop = {"target_error": None, "max_samples": 256}
+    return w.to_glb(), {"version": 1, "volumes": [grid], "max_bounces": max_bounces, "stop": stop}
+
+
+def plane_under_sun(albedo: float = 0.5, irradiance: float = 3.0, direction: Vec3 = (0.48, -0.8, 0.36), half_width: float = 4096.0) -> Example:
+    """A plane at y = 0, facing up, under a directional light of the glTF's; one probe 1 m above it.
+
+    With E⊥ the light's irradiance and d its unit direction of travel, the plane's radiance is L = a·E⊥·|d.y|/π, and a receiver of
+    normal n in the open above an endless plane has E(n) = π·L·(1−n.y)/2: a·E⊥·|d.y| facing down, half of it on a vertical receiver, 0 facing up.
+    A plane that ends at `half_width` w loses 0.82/w² of the first and 1.14/w of the second.
+    """
+    w = GlbWriter()
+    plane = w.mesh("plane", [_part([_horizontal((-half_width, half_width), (-half_width, half_width), 0.0, up=True)], w.material("plane", (albedo,) * 3))])
+    w.node("plane", mesh=plane)
+    w.node("sun", light=w.light("directional", intensity=irradiance), matrix=look_at((0, 0, 0), direction))
+    grid = {"name": "above", "origin": [0.0, 1.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
+    stop = {"target_error": None, "max_samples": 256}
+    return w.to_glb(), {"version": 1, "volumes": [grid], "resolution": {"irradiance": 16}, "stop": stop}
+
+
+def square_emitter(radiance: float = 1.0, *, shared: bool = True) -> Example:
+    """A black unit square at x = 1 that emits towards the probe at the origin, and its twin at x = -1, mirrored by a scale of -1.
+
+    At the origin, E(+x) = E(-x) = π·Le·F, F = (4/π)·(X/√(1+X²))·atan(X/√(1+X²)), X = 1/2: the form factor of a rectangle 1 m away from an
+    element parallel to it (Howell, A Catalog of Radiation Heat Transfer Configuration Factors, B-4). E = 0.752275·Le.
+
+    Parameters
+    ----------
+    radiance : float
+        Le, from the front of each square.
+    shared : bool
+        True: both nodes share a mesh, so both are instances. False: each has its own, so both are baked into the static world.
+    """
+    w = GlbWriter()
+    glow = w.material("glow", (0.0, 0.0, 0.0), emission=(radiance,) * 3)
+    square = np.array([[1, -0.5, -0.5], [1, -0.5, 0.5], [1, 0.5, 0.5], [1, 0.5, -0.5]], np.float64)
+    part = _part([square], glow)
+    mesh = w.mesh("square", [part])
+    w.node("square", mesh=mesh)
+    w.node("twin", mesh=mesh if shared else w.mesh("twin", [part]), scale=(-1, 1, 1))
+    grid = {"name": "between", "origin": [0.0, 0.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
+    stop = {"target_error": None, "max_samples": 256}
+    return w.to_glb(), {"version": 1, "volumes": [grid], "resolution": {"irradiance": 16}, "stop": stop}
+
+
+def square_emitter_irradiance(radiance: float = 1.0) -> float:
+    """Closed form of :func:`square_emitter` at the origin, facing either square."""
+    x = 0.5 / math.sqrt(1.25)
+    return radiance * 4 * x * math.atan(x)
+
+
+def two_rooms(albedo: float = 0.7) -> Example:
+    """Two sealed rooms of 4 × 3 × 4 m beside each other, a wall of 2 cm between them; a lamp in the left one's ceiling.
+
+    The rooms are x in [-4.01, -0.01] and [0.01, 4.01], y in [0, 3], z in [-2, 2]. In the right one every irradiance is exactly 0.
+    The probes (8 × 3 × 4, 1 m apart) stand half a metre from the walls, none in the wall between.
+    """
+    w = GlbWriter()
+    wall = w.material("wall", (albedo,) * 3)
+    lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(10.0, 10.0, 10.0))
+    glow = _horizontal((-2.51, -1.51), (-0.5, 0.5), 2.98, up=False)
+    lit = w.mesh("lit room", [_part(_box((-4.01, 0, -2), (-0.01, 3, 2)), wall), _part([glow], lamp)])
+    dark = w.mesh("dark room", [_part(_box((0.01, 0, -2), (4.01, 3, 2)), wall)])
+    w.node("lit room", mesh=lit)
+    w.node("dark room", mesh=dark)
+    w.node("lit", camera=w.camera(math.radians(70)), matrix=look_at((-3.8, 1.6, 1.8), (-0.5, 1.2, -1.0)))
+    w.node("dark", camera=w.camera(math.radians(70)), matrix=look_at((3.8, 1.6, 1.8), (0.5, 1.2, -1.0)))
+    grid = {"name": "rooms", "origin": [-3.5, 0.5, -1.5], "spacing": [1.0, 1.0, 1.0], "counts": [8, 3, 4]}
+    return w.to_glb(), {"version": 1, "volumes": [grid]}
