@@ -1,0 +1,196 @@
+"""The irradiance query in numpy: what ``shaders/irradiance.glsl`` computes, for thousands of points at once.
+
+Every function mirrors the GLSL function of the same name; see there for the papers. Texels are the bundle's float32; everything
+else is float64, so differences from GLSL are GLSL's rounding (tests hold them to 2e-5 of a volume's brightest texel).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bake_core.octahedral import dir_to_oct
+from bake_core.shader_constants import probe_texels, surface_bias
+
+if TYPE_CHECKING:
+    from bake_core.bundle import Atlas, VolumeData
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+# As in shaders/irradiance.glsl.
+FACING_FLOOR = 0.2
+CRUSH_THRESHOLD = 0.2
+# Points at once: bounds the memory of the 8 corners' texels to some 100 MB.
+CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Irradiance at n points, and how it came about.
+
+    Attributes
+    ----------
+    irradiance : (n, 3) float64
+        E, no 1/π inside; everything but the direct light of punctual and directional lights.
+    weights : (n, 8) float64
+        Of the probes around each point; they sum to 1, or are all 0 where every probe is inside geometry.
+    probes : (n, 8) int64
+        Flat indices of those probes within the volume. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
+    volume : (n,) int64
+        Index of the volume that answered.
+    """
+
+    irradiance: F64
+    weights: F64
+    probes: I64
+    volume: I64
+
+
+def sample(volumes: Sequence[VolumeData], positions: ArrayLike, normals: ArrayLike, wo: ArrayLike | None = None) -> Samples:
+    """Irradiance at surface points. Mirrors ``obIrradiance``.
+
+    Parameters
+    ----------
+    volumes : sequence of VolumeData
+        A bundle's, in its order, each with an irradiance atlas.
+    positions : (n, 3) float
+        World, metres. Any point is valid: outside all volumes the nearest cell of the nearest volume answers.
+    normals : (n, 3) float
+        Unit. Not renormalised.
+    wo : (n, 3) float, optional
+        Unit, to the viewer; the normals where left out.
+    """
+    positions = np.asarray(positions, np.float64).reshape(-1, 3)
+    normals = np.asarray(normals, np.float64).reshape(-1, 3)
+    wo = normals if wo is None else np.asarray(wo, np.float64).reshape(-1, 3)
+    chosen = select_volume(volumes, positions)
+    out = Samples(np.zeros((len(positions), 3)), np.zeros((len(positions), 8)), np.zeros((len(positions), 8), np.int64), chosen)
+    for v, volume in enumerate(volumes):
+        table = probe_texels(volume).reshape(-1, 4).astype(np.float64)
+        of_volume = np.flatnonzero(chosen == v)
+        for first in range(0, len(of_volume), CHUNK):
+            at = of_volume[first : first + CHUNK]
+            out.irradiance[at], out.weights[at], out.probes[at] = _in_volume(volume, table, positions[at], normals[at], wo[at])
+    return out
+
+
+def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
+    """Index of the first volume that contains each point, the nearest one where none does. Mirrors ``obSelectVolume``.
+
+    An axis with one probe reaches half a spacing to both sides.
+    """
+    squared = np.empty((len(volumes), len(positions)))
+    for v, volume in enumerate(volumes):
+        margin = np.where(volume.counts == 1, 0.5, 0.0) * volume.spacing
+        p = positions - volume.origin
+        d = np.maximum(np.maximum(-margin - p, p - (volume.counts - 1) * volume.spacing - margin), 0)
+        squared[v] = (d * d).sum(-1)
+    nearest: I64 = squared.argmin(0).astype(np.int64)
+    return nearest
+
+
+def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
+    """The cell around each point, the nearest one where it is outside. Mirrors ``obCell``.
+
+    Returns
+    -------
+    base : (n, 3) int64
+        Lattice index of the cell's lowest probe.
+    fraction : (n, 3) float64
+        In [0, 1], how far through the cell the point is; 0 along an axis with one probe.
+    """
+    last = volume.counts - 1
+    g = np.clip((positions - volume.origin) / volume.spacing, 0, last)
+    base = np.minimum(np.floor(g), np.maximum(last - 1, 0)).astype(np.int64)
+    return base, g - base
+
+
+def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64) -> tuple[F64, F64, I64]:
+    """Mirrors ``obIrradianceInVolume``: irradiance, weights and probes; `table` is the volume's probe table, one row a probe."""
+    n = len(positions)
+    base, fraction = cell(volume, positions)
+    normal_bias, view_bias = surface_bias(volume)
+    biased = positions + normals * normal_bias + wo * view_bias
+    oct_normal = dir_to_oct(normals)
+    probes = np.empty((n, 8), np.int64)
+    trilinear, other, light = np.empty((n, 8)), np.empty((n, 8)), np.empty((n, 8, 3))
+    for corner in range(8):
+        upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
+        lattice = np.minimum(base + upper, volume.counts - 1)
+        probe = lattice @ np.array([1, volume.counts[0], volume.counts[0] * volume.counts[1]])
+        position = volume.origin + volume.spacing * lattice + table[probe, :3]
+        weight = _facing(position - positions, normals) * _visibility(volume, probe, biased - position)
+        probes[:, corner] = probe
+        other[:, corner] = _crush(weight) * table[probe, 3]
+        trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
+        light[:, corner] = bilinear(volume.atlases["irradiance"], probe, oct_normal)
+    weights = trilinear * other
+    # Where nothing is left, the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
+    weights = np.where(weights.sum(-1, keepdims=True) > 0, weights, other)
+    total = weights.sum(-1, keepdims=True)
+    weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
+    return (weights[:, :, None] * light).sum(1), weights, probes
+
+
+def bilinear(atlas: Atlas, probe: I64, oct_xy: NDArray[np.floating]) -> F64:
+    """Bilinear look-up in probes' tiles. Mirrors ``obTile``, ``obTileCoordinates`` and a texture unit.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    probe : (n,) int64
+        Flat indices.
+    oct_xy : (n, 2) floating
+        Points in [-1, 1]^2.
+
+    Returns
+    -------
+    (n, channels) float64
+    """
+    row, column = np.divmod(probe, atlas.columns)
+    layer, row = np.divmod(row, atlas.rows)
+    # Texel centres are at +0.5; the border is the first texel.
+    x = 0.5 + (oct_xy[:, 0] * 0.5 + 0.5) * atlas.interior
+    y = 0.5 + (oct_xy[:, 1] * 0.5 + 0.5) * atlas.interior
+    x0 = np.clip(np.floor(x), 0, atlas.interior).astype(np.int64)
+    y0 = np.clip(np.floor(y), 0, atlas.interior).astype(np.int64)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    column, row = column * atlas.tile + x0, row * atlas.tile + y0
+    t = atlas.texels
+    low = t[layer, row, column] * (1 - fx) + t[layer, row, column + 1] * fx
+    high = t[layer, row + 1, column] * (1 - fx) + t[layer, row + 1, column + 1] * fx
+    out: F64 = low * (1 - fy) + high * fy
+    return out
+
+
+def _facing(to_probe: F64, normals: F64) -> F64:
+    """Mirrors ``obFacing``."""
+    wrap = 0.5 + 0.5 * (to_probe * normals).sum(-1) / np.maximum(np.linalg.norm(to_probe, axis=-1), 1e-20)
+    out: F64 = wrap * wrap + FACING_FLOOR
+    return out
+
+
+def _visibility(volume: VolumeData, probe: I64, from_probe: F64) -> F64:
+    """Mirrors ``obVisibility``."""
+    out = np.ones(len(probe))
+    r = np.minimum(np.linalg.norm(from_probe, axis=-1), volume.distance_limit)
+    atlas = volume.atlases.get("visibility")
+    if atlas is None:
+        return out
+    apart = np.flatnonzero(r > 0)
+    mean, square = bilinear(atlas, probe[apart], dir_to_oct(from_probe[apart])).T
+    beyond = r[apart] - mean
+    variance = np.maximum(square - mean * mean, 1e-5 * square)
+    bound = variance / np.maximum(variance + beyond * beyond, 1e-37)
+    out[apart] = np.where(beyond > 0, np.maximum(bound**3, volume.parameters["visibility_floor"]), 1)
+    return out
+
+
+def _crush(weight: F64) -> F64:
+    """Mirrors ``obCrush``."""
+    return np.where(weight < CRUSH_THRESHOLD, weight**3 / CRUSH_THRESHOLD**2, weight)

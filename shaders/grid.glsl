@@ -1,0 +1,55 @@
+// Where probes stand, and where their tiles lie in the atlases.
+// Comes before constants.glsl, which is generated for each bundle and fills the struct below.
+
+// One volume: a grid of probes. Lengths in metres, in the frame that constants.glsl was generated for (world unless it says otherwise).
+struct ObVolume {
+    vec3 origin;            // lattice point of probe (0, 0, 0)
+    vec3 spacing;           // between neighbouring lattice points
+    ivec3 counts;           // probes along x, y, z
+    ivec2 tiles;            // columns and rows of tiles in one layer of every atlas
+    int irradianceTexels;   // interior texels along the side of a tile, without its border
+    int visibilityTexels;   // likewise; 0: the bundle has no visibility, every probe counts as visible
+    float distanceLimit;    // to which visibility distances were clamped
+    float normalBias;       // how far a point is moved along its normal before visibility is asked for
+    float viewBias;         // how far along the direction to the viewer
+    float visibilityFloor;  // least weight of a probe that is not visible, so that a point that no probe sees is not black
+};
+
+// The cell around a point: its lowest probe, and how far through the cell the point is.
+struct ObCell {
+    ivec3 base;
+    vec3 fraction;
+};
+
+// The cell of a point, the nearest one where the point is outside. An axis with one probe has fraction 0.
+ObCell obCell(ObVolume volume, vec3 position) {
+    vec3 last = vec3(volume.counts - 1);
+    vec3 g = clamp((position - volume.origin) / volume.spacing, vec3(0.0), last);
+    vec3 base = min(floor(g), max(last - 1.0, vec3(0.0)));
+    return ObCell(ivec3(base), g - base);
+}
+
+// Squared distance from a point to a volume's box, 0 inside. An axis with one probe reaches half a spacing to both sides.
+float obDistanceSquared(ObVolume volume, vec3 position) {
+    vec3 last = vec3(volume.counts - 1);
+    vec3 margin = vec3(equal(volume.counts, ivec3(1))) * 0.5 * volume.spacing;
+    vec3 p = position - volume.origin;
+    vec3 d = max(max(-margin - p, p - last * volume.spacing - margin), vec3(0.0));
+    return dot(d, d);
+}
+
+// Column, row and layer of a probe's tile, the same in every atlas. Probe (i, j, k) has the flat index i + nx * (j + ny * k).
+ivec3 obTile(ObVolume volume, ivec3 probe) {
+    int index = probe.x + volume.counts.x * (probe.y + volume.counts.y * probe.z);
+    int row = index / volume.tiles.x;
+    int layer = row / volume.tiles.y;
+    return ivec3(index - row * volume.tiles.x, row - layer * volume.tiles.y, layer);
+}
+
+// Texture coordinates (u, v, layer) of a point of the octahedral square in a tile of n x n interior texels.
+// The border of one texel around a tile wraps octahedrally, so bilinear filtering is right up to its edge.
+vec3 obTileCoordinates(ObVolume volume, ivec3 tile, int n, vec2 oct) {
+    float side = float(n + 2);
+    vec2 texel = vec2(tile.xy) * side + 1.0 + (oct * 0.5 + 0.5) * float(n);
+    return vec3(texel / (vec2(volume.tiles) * side), float(tile.z));
+}

@@ -1,0 +1,92 @@
+// Diffuse light from probes: irradiance at a surface point from the eight probes around it.
+// Majercik et al. 2019, "Dynamic Diffuse Global Illumination with Ray-Traced Irradiance Fields", JCGT 8(2), section 5;
+// Majercik et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production", JCGT 10(2), for the surface bias.
+// Mirrors bake_core/irradiance.py. Needs octahedral.glsl, grid.glsl, constants.glsl, and three macros of the host (see README.md):
+//   OB_IRRADIANCE(v, uvw)   vec3, bilinear, from volume v's irradiance atlas
+//   OB_VISIBILITY(v, uvw)   vec2, bilinear, from volume v's visibility atlas
+//   OB_PROBE(v, texel)      vec4, one texel, from volume v's probe table
+
+// How much a probe counts by where it stands: most in front of the surface, little behind it, never nothing (a cell may have no other).
+// Majercik et al. 2019, section 5.2, the "wrap shading" weight. 0.2 is theirs: without it, cells with probes on one side only flicker.
+float obFacing(vec3 toProbe, vec3 normal) {
+    // The floor under the length is for a point that stands on the probe: it has no direction, and counts as seen edge-on.
+    float wrap = 0.5 + 0.5 * dot(toProbe, normal) / max(length(toProbe), 1e-20);
+    return wrap * wrap + 0.2;
+}
+
+// How much of a probe's filtered surroundings lets it see a point: Chebyshev's bound on the share of distances beyond the point's,
+// Donnelly and Lauritzen 2006, "Variance Shadow Maps"; cubed against leaks as in Majercik et al. 2019, section 5.2.
+float obVisibility(int v, ObVolume volume, ivec3 tile, vec3 fromProbe) {
+    float r = min(length(fromProbe), volume.distanceLimit);
+    if (volume.visibilityTexels == 0 || r == 0.0) {
+        return 1.0;
+    }
+    vec2 moments = OB_VISIBILITY(v, obTileCoordinates(volume, tile, volume.visibilityTexels, obDirToOct(fromProbe)));
+    float beyond = r - moments.x;
+    if (beyond <= 0.0) {
+        return 1.0;
+    }
+    // float32 leaves noise of 1e-7 of the second moment in this difference; the bound says the spread is at least 0.3 % of the distance,
+    // a quarter of what the prefilter makes of a flat wall.
+    float variance = max(moments.y - moments.x * moments.x, 1e-5 * moments.y);
+    // The floor keeps 0/0 from a probe that touches what it sees.
+    float bound = variance / max(variance + beyond * beyond, 1e-37);
+    return max(bound * bound * bound, volume.visibilityFloor);
+}
+
+// Small weights made smaller still, without a step: light from a probe that hardly counts is mostly leaked light.
+// Majercik et al. 2019, section 5.2; the threshold is theirs.
+float obCrush(float weight) {
+    const float threshold = 0.2;
+    return weight < threshold ? weight * weight * weight / (threshold * threshold) : weight;
+}
+
+// Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
+// (facing times visibility, crushed) times the probe's state (1, or 0 inside geometry).
+vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo) {
+    ObVolume volume = OB_VOLUME[v];
+    ObCell cell = obCell(volume, position);
+    vec3 biased = position + normal * volume.normalBias + wo * volume.viewBias;
+    vec2 octNormal = obDirToOct(normal);
+    vec4 sum = vec4(0.0);
+    vec4 rest = vec4(0.0);
+    for (int corner = 0; corner < 8; ++corner) {
+        ivec3 upper = ivec3(corner & 1, (corner >> 1) & 1, corner >> 2);
+        ivec3 probe = min(cell.base + upper, volume.counts - 1);
+        ivec3 tile = obTile(volume, probe);
+        vec4 state = OB_PROBE(v, tile);
+        vec3 probePosition = volume.origin + volume.spacing * vec3(probe) + state.xyz;
+        float weight = obFacing(probePosition - position, normal) * obVisibility(v, volume, tile, biased - probePosition);
+        weight = obCrush(weight) * state.w;
+        vec3 irradiance = OB_IRRADIANCE(v, obTileCoordinates(volume, tile, volume.irradianceTexels, octNormal));
+        vec3 axes = mix(1.0 - cell.fraction, cell.fraction, vec3(upper));
+        sum += vec4(irradiance, 1.0) * (weight * axes.x * axes.y * axes.z);
+        rest += vec4(irradiance, 1.0) * weight;
+    }
+    // Nothing in the first sum: the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
+    vec4 chosen = sum.w > 0.0 ? sum : rest;
+    return chosen.w > 0.0 ? chosen.xyz / chosen.w : vec3(0.0);
+}
+
+// The first volume that contains a point, in the order of the spec; the nearest one where none does.
+int obSelectVolume(vec3 position) {
+    int nearest = 0;
+    float least = 3.4e38;
+    for (int v = 0; v < OB_VOLUMES; ++v) {
+        float d = obDistanceSquared(OB_VOLUME[v], position);
+        if (d < least) {
+            least = d;
+            nearest = v;
+        }
+    }
+    return nearest;
+}
+
+// The one entry point for diffuse light: irradiance E (the integral of radiance times cosine over the hemisphere, no 1/pi inside)
+// that arrives at a surface point, except the direct light of punctual and directional lights. Reflected radiance is albedo * E / pi.
+//   position  the point, in the frame of constants.glsl
+//   normal    unit shading normal, on the side that is seen
+//   wo        unit, from the point to the viewer; the normal itself where there is none
+vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
+    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo);
+}
