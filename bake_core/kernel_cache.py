@@ -12,22 +12,22 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, MutableMapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 # Old folders serve a checkout that goes back and forth between versions; a week later they are only in the way.
 KEEP_SECONDS = 7 * 24 * 3600
 
 
-def use_kernel_cache(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Name numba's cache folder in `environment`, for this process and its children, before the first kernel is declared.
+def kernel_cache_dir(environment: Mapping[str, str] = os.environ) -> Path:
+    """The folder for ``numba.config.CACHE_DIR``.
 
-    ``NUMBA_CACHE_DIR`` is left alone where somebody has set it, as an image of a read-only installation does.
+    ``NUMBA_CACHE_DIR`` goes first where somebody has set it, as an image of a read-only installation does.
     """
-    if "NUMBA_CACHE_DIR" not in environment:
-        package = Path(__file__).resolve().parent
-        name = f"kernels-{_digest(package.glob('*.py'))}"
-        environment["NUMBA_CACHE_DIR"] = str(_first_writable((package / "__pycache__", _user_cache(environment)), name))
+    if chosen := environment.get("NUMBA_CACHE_DIR"):
+        return Path(chosen)
+    package = Path(__file__).resolve().parent
+    return _first_writable((package / "__pycache__", _user_cache(environment)), f"kernels-{_digest(package.glob('*.py'))}")
 
 
 def _digest(sources: Iterable[Path]) -> str:

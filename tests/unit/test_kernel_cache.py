@@ -22,9 +22,7 @@ def test_folder_is_named_by_every_source(tmp_path: Path) -> None:
 
 
 def test_somebodys_choice_is_left_alone() -> None:
-    environment = {"NUMBA_CACHE_DIR": "elsewhere"}
-    kernel_cache.use_kernel_cache(environment)
-    assert environment == {"NUMBA_CACHE_DIR": "elsewhere"}
+    assert kernel_cache.kernel_cache_dir({"NUMBA_CACHE_DIR": "elsewhere"}) == Path("elsewhere")
 
 
 def test_read_only_installation_falls_back_to_the_users_cache(tmp_path: Path) -> None:
