@@ -57,7 +57,8 @@ def cornell() -> Example:
     sides = _box((-1, 0, -1), (1, 2, 1))
     # The lamp hangs 1 cm below the ceiling: two surfaces in one plane would have no order.
     glow = _horizontal((-0.35, 0.35), (-0.3, 0.3), 1.99, up=False)
-    room = w.mesh("room", [_part([sides[2], sides[3], sides[4]], white), _part([sides[0]], left), _part([sides[1]], right), _part([glow], lamp)])
+    plain = _part([sides[2], sides[3], sides[4]], white)
+    room = w.mesh("room", [plain, _part([sides[0]], left), _part([sides[1]], right), _part([glow], lamp)])
     # A block stands on the floor and has no bottom.
     faces = _box((-0.5, 0, -0.5), (0.5, 1, 0.5))
     block = w.mesh("block", [_part([f for i, f in enumerate(faces) if i != 2], blocks, outwards=True)])
@@ -96,16 +97,20 @@ def closed_box(albedo: float, emission: float, max_bounces: int | None = None) -
     return w.to_glb(), {"version": 1, "volumes": [grid], "max_bounces": max_bounces, "stop": stop}
 
 
-def plane_under_sun(albedo: float = 0.5, irradiance: float = 3.0, direction: Vec3 = (0.48, -0.8, 0.36), half_width: float = 4096.0) -> Example:
+def plane_under_sun(
+    albedo: float = 0.5, irradiance: float = 3.0, direction: Vec3 = (0.48, -0.8, 0.36), half_width: float = 4096.0
+) -> Example:
     """A plane at y = 0, facing up, under a directional light of the glTF's; one probe 1 m above it.
 
     With E⊥ the light's irradiance and d its unit direction of travel, the plane's radiance is L = a·E⊥·|d.y|/π, and a receiver of
-    normal n in the open above an endless plane has E(n) = π·L·(1−n.y)/2: a·E⊥·|d.y| facing down, half of it on a vertical receiver, 0 facing up.
+    normal n in the open above an endless plane has E(n) = π·L·(1−n.y)/2: a·E⊥·|d.y| facing down, half of it on a vertical receiver,
+    0 facing up.
     A plane that ends at `half_width` w loses 0.82/w² of the first and 1.14/w of the second.
     """
     w = GlbWriter()
-    plane = w.mesh("plane", [_part([_horizontal((-half_width, half_width), (-half_width, half_width), 0.0, up=True)], w.material("plane", (albedo,) * 3))])
-    w.node("plane", mesh=plane)
+    span = (-half_width, half_width)
+    plane = _part([_horizontal(span, span, 0.0, up=True)], w.material("plane", (albedo,) * 3))
+    w.node("plane", mesh=w.mesh("plane", [plane]))
     w.node("sun", light=w.light("directional", intensity=irradiance), matrix=look_at((0, 0, 0), direction))
     grid = {"name": "above", "origin": [0.0, 1.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
     stop = {"target_error": None, "max_samples": 256}

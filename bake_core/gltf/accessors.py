@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,10 @@ MAX_ZEROS = 1 << 20
 class View:
     """A slice of a buffer; `stride` is 0 where elements are tightly packed."""
 
-    where: str
+    fields: Fields
     data: memoryview
     offset: int
     stride: int
-    compressed: Fields
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,11 @@ class Accessors:
         """
         accessor = self._require(index, INDICES, where)
         if accessor.view is not None and self._views[accessor.view].stride:
-            fail("bad_stride", f"indices must be tightly packed, but {self._views[accessor.view].where} has a byteStride", where)
+            fail("bad_stride", f"indices must be tightly packed, but {self._views[accessor.view].fields.where} has a byteStride", where)
         values: NDArray[np.unsignedinteger] = self._read(accessor)[:, 0]
-        if values.size and int(values.max()) == np.iinfo(values.dtype).max:
-            fail("primitive_restart", f"has the value {np.iinfo(values.dtype).max}, which glTF does not allow (primitive restart)", where)
+        restart = np.iinfo(values.dtype).max
+        if values.max() == restart:
+            fail("primitive_restart", f"has the value {restart}, which glTF does not allow (primitive restart)", where)
         return values
 
     def check_attribute(self, index: int, semantic: str, where: str) -> None:
@@ -128,7 +129,7 @@ class Accessors:
                 if not finite.all():
                     fail("not_finite", f"element {int(np.argmin(finite))} is NaN or infinite", accessor.where)
             else:
-                values = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+                values = np.divide(values, np.iinfo(values.dtype).max, dtype=np.float32)
             self._floats[index] = values
         return self._floats[index]
 
@@ -141,20 +142,19 @@ class Accessors:
             fail("bad_accessor", f"accessor {index} has no bufferView and is not sparse: it has no data", where)
         for view in [a.view, *(a.sparse.child(k).value["bufferView"] for k in ("indices", "values") if a.sparse)]:
             if view is not None:
-                extensions.of(self._views[view].compressed)
+                extensions.of(self._views[view].fields)
         return a
 
-    def _read(self, a: Accessor) -> NDArray[np.generic]:
+    def _read(self, a: Accessor) -> NDArray[Any]:
         """(count, rows) values with the sparse ones in place; a view of the buffer where it can be."""
         rows = SHAPES[a.kind][1]
+        values: NDArray[Any]
         if a.view is None:
             values = np.zeros((a.count, rows), DTYPES[a.component])
         else:
             view = self._views[a.view]
             size = np.dtype(DTYPES[a.component]).itemsize
-            values = np.ndarray(
-                (a.count, rows), DTYPES[a.component], view.data, view.offset + a.offset, (view.stride or size * rows, size)
-            )
+            values = np.ndarray((a.count, rows), DTYPES[a.component], view.data, view.offset + a.offset, (view.stride or size * rows, size))
         if a.sparse is not None:
             values = values.copy()
             count = a.sparse.value["count"]
@@ -165,7 +165,7 @@ class Accessors:
             values[at] = self._packed(new, a.component, count, rows)
         return values
 
-    def _packed(self, part: Fields, component: int, count: int, rows: int) -> NDArray[np.generic]:
+    def _packed(self, part: Fields, component: int, count: int, rows: int) -> NDArray[Any]:
         view = self._views[part.value["bufferView"]]
         return np.ndarray((count, rows), DTYPES[component], view.data, view.offset + part.value.get("byteOffset", 0))
 
@@ -209,13 +209,13 @@ class Accessors:
     def _check_fit(self, f: Fields, index: int, offset: int, count: int, element: int, size: int) -> None:
         view = self._views[index]
         if view.stride and view.stride < element:
-            fail("bad_stride", f"{view.where} has byteStride {view.stride}, less than the {element} bytes of an element", f.where)
+            fail("bad_stride", f"{view.fields.where} has byteStride {view.stride}, less than the {element} bytes of an element", f.where)
         if offset % size or (view.offset + offset) % size or view.stride % size:
-            fail("misaligned", f"must begin at a multiple of {size} bytes, in {view.where} and in its buffer", f.place("byteOffset"))
+            fail("misaligned", f"must begin at a multiple of {size} bytes, in {view.fields.where} and in its buffer", f.place("byteOffset"))
         needed = offset + (view.stride or element) * (count - 1) + element
         length = len(view.data) - view.offset
         if needed > length:
-            fail("accessor_out_of_view", f"{count} elements need {needed} bytes, but {view.where} has {length}", f.place("count"))
+            fail("accessor_out_of_view", f"{count} elements need {needed} bytes, but {view.fields.where} has {length}", f.place("count"))
 
 
 def _view(f: Fields, buffers: tuple[memoryview, ...]) -> View:
@@ -225,9 +225,10 @@ def _view(f: Fields, buffers: tuple[memoryview, ...]) -> View:
     stride = f.integer("byteStride", default=0)
     if "byteStride" in f and (not 4 <= stride <= 252 or stride % 4):
         fail("bad_stride", f"is {stride}, must be a multiple of 4 from 4 to 252", f.place("byteStride"))
-    if offset + length > len(buffers[buffer]):
-        fail("view_out_of_buffer", f"ends at byte {offset + length}, but buffers[{buffer}] has {len(buffers[buffer])}", f.place("byteLength"))
-    return View(f.where, buffers[buffer][: offset + length], offset, stride, f)
+    available = len(buffers[buffer])
+    if offset + length > available:
+        fail("view_out_of_buffer", f"ends at byte {offset + length}, but buffers[{buffer}] has {available}", f.place("byteLength"))
+    return View(f, buffers[buffer][: offset + length], offset, stride)
 
 
 def _component(f: Fields, allowed: tuple[int, ...]) -> int:
@@ -244,5 +245,3 @@ def semantic_of(attribute: str) -> str | None:
     if stem in ("POSITION", "NORMAL", "TANGENT"):
         return stem if attribute == stem else None
     return stem if stem in ATTRIBUTES and number.isascii() and number.isdecimal() else None
-
-

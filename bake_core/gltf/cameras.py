@@ -67,9 +67,10 @@ def _rigid(world: F64, where: str) -> F64:
     size = np.abs(world[:3, :3]).max()
     back, up = (world[:3, 2] / size, world[:3, 1] / size) if size > 0 else (np.zeros(3), np.zeros(3))
     right = np.cross(up, back)
-    lengths = np.linalg.norm(back), np.linalg.norm(right)
-    if min(lengths) < 1e-12 * max(1.0, *lengths):
+    depth, width = float(np.linalg.norm(back)), float(np.linalg.norm(right))
+    # 1e-12: the cross product of parallel axes is rounding, not a direction.
+    if min(depth, width) < 1e-12:
         fail("bad_transform", "its scale leaves its camera no direction", where)
-    back, right = back / lengths[0], right / lengths[1]
+    back, right = back / depth, right / width
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
     return matrix

@@ -86,7 +86,7 @@ def _open(name: str, path: Path, opener: Opener) -> Document:
         text, binary = _chunks(data, name, notes)
     else:
         text, binary = data, None
-    root = Fields(strict_json.parse(text, SceneError, "gltf", name), "")
+    root = Fields(strict_json.parse(text, SceneError, "gltf", name), name).at("")
     _check_version(root)
     extensions.check_required(root, notes)
     for image in root.children("images"):

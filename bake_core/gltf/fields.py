@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from bake_core.errors import SceneError
 
+_KINDS = {dict: "an object", list: "a list", str: "a string", bool: "true or false", int: "a whole number", float: "a fraction"}
 # JSON integers have no limit; nothing that a file counts or points at is larger than what a file offset holds.
 MAX_INTEGER = 2**63 - 1
 
@@ -43,9 +44,7 @@ class Notes:
             self._first.setdefault(what, where)
 
     def lines(self) -> tuple[str, ...]:
-        return tuple(
-            f"{what} (at {self._first[what]}" + (f", and {n - 1} more)" if n > 1 else ")") for what, n in self._count.items()
-        )
+        return tuple(f"{what} (at {self._first[what]}" + (f", and {n - 1} more)" if n > 1 else ")") for what, n in self._count.items())
 
 
 class Fields:
@@ -65,6 +64,10 @@ class Fields:
 
     def __contains__(self, key: str) -> bool:
         return key in self.value
+
+    def at(self, where: str) -> Fields:
+        """The same object by another name."""
+        return Fields(self.value, where)
 
     def place(self, key: str) -> str:
         return f"{self.where}.{key}" if self.where else key
@@ -126,8 +129,10 @@ class Fields:
 
     def texts(self, key: str) -> list[str]:
         place = self.place(key)
-        return [v if type(v) is str else fail("wrong_type", f"must be a string, not {_kind(v)}", f"{place}[{i}]")
-                for i, v in enumerate(self._list(key))]
+        return [
+            v if type(v) is str else fail("wrong_type", f"must be a string, not {_kind(v)}", f"{place}[{i}]")
+            for i, v in enumerate(self._list(key))
+        ]
 
     def child(self, key: str) -> Fields:
         """An object, empty where there is none."""
@@ -181,8 +186,7 @@ def _number(value: Any, low: float, high: float, where: str) -> float:
 
 def _kind(value: Any) -> str:
     """A JSON value's type in JSON's words."""
-    names = {dict: "an object", list: "a list", str: "a string", bool: "true or false", int: "a whole number", float: "a number with a fraction"}
-    return names.get(type(value), "null")
+    return _KINDS.get(type(value), "null")
 
 
 def _short(value: int) -> str:

@@ -27,14 +27,14 @@ class Row:
     double_sided: bool = False
 
 
-def read_materials(root: Fields, used: Collection[int], with_default: bool, notes: Notes) -> tuple[Materials, dict[int | None, int]]:
-    """The materials in `used`, in the file's order, then the default one where it is wanted.
+def read_materials(root: Fields, used: Collection[int | None], notes: Notes) -> tuple[Materials, dict[int | None, int]]:
+    """The materials in `used`, in the file's order; None stands for glTF's default material, and comes last.
 
     Returns
     -------
     materials : Materials
     row : dict
-        Index in the file (None: the default material) to row.
+        Index in the file, or None, to row.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def read_materials(root: Fields, used: Collection[int], with_default: bool, note
             rows.append(row)
         elif unsupported is not None:
             notes.add("a material that nothing uses", fields.where)
-    if with_default:
+    if None in used:
         row_of[None] = len(rows)
         rows.append(Row())
     return _columns(rows), row_of

@@ -122,7 +122,7 @@ def _check_primitive(p: Fields, accessors: Accessors, materials: int, notes: Not
     if mode < TRIANGLES:
         notes.add(f"{MODES[mode]}, which have no area", p.where)
         return None
-    if corners < 3 or mode == TRIANGLES and corners % 3:
+    if corners < 3 or (mode == TRIANGLES and corners % 3):
         counted = p.where if indices is None else p.place("indices")
         fail("bad_count", f"{corners} vertices do not make {MODES[mode]}", counted)
     count = corners // 3 if mode == TRIANGLES else corners - 2
@@ -217,8 +217,9 @@ def _unit(vectors: F32) -> F32:
 
 def _rgba(colors: F32) -> F32:
     # glTF 2.0, 3.7.2.1: COLOR_n must be clamped to [0, 1].
-    clamped = np.clip(colors, 0, 1)
-    return clamped if clamped.shape[1] == 4 else np.pad(clamped, ((0, 0), (0, 1)), constant_values=1)
+    clamped: F32 = np.clip(colors, 0, 1)
+    padded: F32 = np.pad(clamped, ((0, 0), (0, 4 - clamped.shape[1])), constant_values=1)
+    return padded
 
 
 def _say_nothing(normals: F32, positions: F32, triangles: U32) -> bool:

@@ -45,7 +45,8 @@ def read_nodes(root: Fields) -> Nodes:
     Raises
     ------
     SceneError
-        ``gltf.no_scene``, ``gltf.two_parents``, ``gltf.duplicate_node``, ``gltf.node_cycle``, ``gltf.not_a_root``, ``gltf.bad_transform``, ``gltf.overflow``.
+        What :class:`Fields` raises, ``gltf.no_scene``, ``gltf.two_parents``,
+        ``gltf.duplicate_node``, ``gltf.node_cycle``, ``gltf.not_a_root``, ``gltf.bad_transform``, ``gltf.overflow``.
     """
     fields = root.children("nodes")
     children = [f.indices("children", len(fields), "nodes") if "children" in f else [] for f in fields]

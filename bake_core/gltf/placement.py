@@ -112,7 +112,8 @@ def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], no
 def _flatness(linear: F64) -> F64:
     """(n,) smallest over largest singular value of (n, 3, 3) matrices; 0 for a zero matrix."""
     values = np.linalg.svd(linear, compute_uv=False)
-    return np.divide(values[:, 2], values[:, 0], out=np.zeros(len(values)), where=values[:, 0] > 0)
+    ratio: F64 = np.divide(values[:, 2], values[:, 0], out=np.zeros(len(values)), where=values[:, 0] > 0)
+    return ratio
 
 
 def _bake(mesh: Mesh, matrix: F64, regular: bool) -> tuple[F64, Mesh]:
@@ -165,7 +166,7 @@ def _instances_box(vertices: F64, transform: F64, centre: F64) -> F64:
 
 
 def _furthest(vertices: F64, rows: F64, offset: F64) -> float:
-    """max over i and v of rows[i]·v + offset[i], without going through every vertex of every instance.
+    """Largest, over i and v, of rows[i]·v + offset[i], without going through every vertex of every instance.
 
     A prototype's box bounds what each instance can reach; in falling order of that bound, few instances need a closer look.
     """

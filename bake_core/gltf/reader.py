@@ -85,7 +85,7 @@ def _load(document: Document) -> Scene:
         notes.extend(mesh_notes[mesh])
     check_size(sum(outlines[m].triangle_count for m in used), "meshes")
     named = {p.material for m in used for p in outlines[m].primitives}
-    table, row_of = read_materials(root, named - {None}, None in named, notes)
+    table, row_of = read_materials(root, named, notes)
     meshes = {m: read_mesh(outlines[m], accessors, row_of) for m in used if outlines[m].primitives}
     placed = place_meshes(meshes, [(n, m) for n, m in uses if m in meshes], nodes)
     lights = read_lights(root, nodes, placed.origin, notes)

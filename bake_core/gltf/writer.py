@@ -66,7 +66,11 @@ class GlbWriter:
         """A material, Lambert unless told otherwise; `emission` is radiance, of any strength."""
         material: dict[str, Any] = {
             "name": name,
-            "pbrMetallicRoughness": {"baseColorFactor": [*map(float, base_color), 1.0], "metallicFactor": metallic, "roughnessFactor": roughness},
+            "pbrMetallicRoughness": {
+                "baseColorFactor": [*map(float, base_color), 1.0],
+                "metallicFactor": metallic,
+                "roughnessFactor": roughness,
+            },
         }
         strength = max(1.0, *map(float, emission))
         if any(emission):
@@ -121,9 +125,7 @@ class GlbWriter:
         """A node; `matrix` is (4, 4), applied to column vectors. Nodes that are nobody's child are the scene's roots."""
         node: dict[str, Any] = {"name": name} if name else {}
         node |= {k: v for k, v in (("mesh", mesh), ("camera", camera)) if v is not None}
-        node |= {
-            k: [*map(float, v)] for k, v in (("translation", translation), ("rotation", rotation), ("scale", scale)) if v is not None
-        }
+        node |= {k: [*map(float, v)] for k, v in (("translation", translation), ("rotation", rotation), ("scale", scale)) if v is not None}
         if matrix is not None:
             node["matrix"] = np.asarray(matrix, np.float64).T.reshape(16).tolist()
         if children:
