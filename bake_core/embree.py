@@ -14,12 +14,12 @@ from functools import cache
 from pathlib import Path
 
 import llvmlite.binding
-import numba
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
 from bake_core.errors import BakeError, MachineError
+from bake_core.kernels import kernel
 from bake_core.scene import Scene
 
 # RTCRayHit of Embree 4.4 as embreex builds it (RTC_MAX_INSTANCE_LEVEL_COUNT 1, instPrimID compiled in), in 4-byte words:
@@ -102,7 +102,7 @@ def new_rayhit() -> NDArray[np.float32]:
     return raw[start : start + RAYHIT_WORDS * 4].view(np.float32)
 
 
-@numba.njit(inline="always")  # type: ignore[untyped-decorator]
+@kernel  # type: ignore[untyped-decorator]
 def set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
     """Fill a ray for either query; `ray_bits` is the same memory seen as uint32."""
     ray[0], ray[1], ray[2], ray[3] = ox, oy, oz, np.float32(0)

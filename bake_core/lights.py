@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bake_core.errors import SpecError
+from bake_core.kernels import kernel
 from bake_core.scene import LIGHT_DIRECTIONAL, LIGHT_POINT, LIGHT_SPOT, Lights, Scene
 from bake_core.spec import ConstantEnvironment, DirectionalLight, PointLight, Spec
 
@@ -173,7 +173,7 @@ def environment_radiance(spec: Spec) -> F64:
     return np.asarray(spec.environment.radiance, np.float64)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@kernel  # type: ignore[untyped-decorator]
 def choose(cdf, u):  # type: ignore[no-untyped-def]
     """First index whose running sum exceeds u: an index, and its chance."""
     low, high = 0, cdf.shape[0] - 1
@@ -186,7 +186,7 @@ def choose(cdf, u):  # type: ignore[no-untyped-def]
     return low, cdf[low] - (cdf[low - 1] if low else 0.0)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@kernel  # type: ignore[untyped-decorator]
 def toward_light(lights, i, px, py, pz):  # type: ignore[no-untyped-def]
     """From a point to light i: unit direction, distance (inf for directional), irradiance over value on a plane facing it.
 

@@ -14,10 +14,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bake_core.errors import SceneError
+from bake_core.kernels import kernel
 from bake_core.sampling import basis, cosine_hemisphere
 from bake_core.scene import Scene
 
@@ -53,7 +53,7 @@ def material_table(scene: Scene) -> MaterialTable:
     return MaterialTable(np.ascontiguousarray(m.base_color), np.ascontiguousarray(m.emission), np.ascontiguousarray(m.double_sided))
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@kernel  # type: ignore[untyped-decorator]
 def lambert_cosine(wx, wy, wz, n):  # type: ignore[no-untyped-def]
     """(wi·ns)+ + (mirror(wi)·ns)+ for wi above the surface, else 0; over π it is the pdf of :func:`sample_lambert`.
 
@@ -67,7 +67,7 @@ def lambert_cosine(wx, wy, wz, n):  # type: ignore[no-untyped-def]
     return max(direct, 0.0) + max(mirrored, 0.0)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@kernel  # type: ignore[untyped-decorator]
 def sample_lambert(u, v, n):  # type: ignore[no-untyped-def]
     """A direction with pdf :func:`lambert_cosine` / π; `n` as there."""
     lx, ly, lz = cosine_hemisphere(u, v)

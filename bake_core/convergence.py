@@ -1,0 +1,99 @@
+"""How wrong a bake still is, and when it stops.
+
+The spread of independent scrambles gives each irradiance texel's standard error (Owen 1997, "Monte Carlo Variance of Scrambled Net
+Quadrature": replicates of a scrambled sequence are independent and unbiased). DESIGN's figure puts them together:
+
+    error = 95 % upper bound of √mean(|ΔE|² / (E² + (0.05 Ē)²)) over irradiance texels of active probes
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.spec import Stop
+
+F64 = NDArray[np.float64]
+
+# Texels darker than this fraction of the mean count as if they were this bright: nobody sees 2 % of black.
+DARK_FRACTION = 0.05
+# One-sided 95 % point of the normal distribution.
+_Z95 = 1.6448536269514722
+# The first pass; each later one doubles the samples.
+FIRST_SAMPLES = 16
+
+Verdict = Literal["continue", "target", "samples", "time"]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of a job's curve of error against run time. `error` is None where it cannot be measured (fewer than two samples a scramble)."""
+
+    samples: int
+    seconds: float
+    error: float | None
+
+
+def next_pass(stop: Stop, samples: int) -> tuple[int, int]:
+    """The half-open range of samples of the pass after `samples` are done: 16, 32, 64, … up to the spec's maximum."""
+    return samples, min(max(FIRST_SAMPLES, 2 * samples), stop.max_samples)
+
+
+def decide(stop: Stop, samples: int, error: float | None, seconds: float) -> Verdict:
+    """Whether to go on after a pass, and if not, why. A target of null never stops early."""
+    if stop.target_error is not None and error is not None and error <= stop.target_error:
+        return "target"
+    if samples >= stop.max_samples:
+        return "samples"
+    if stop.max_seconds is not None and seconds >= stop.max_seconds:
+        return "time"
+    return "continue"
+
+
+def relative_error(sums: F64, samples: int, active: NDArray[np.bool_]) -> float | None:
+    """DESIGN's error figure from per-scramble sums.
+
+    Parameters
+    ----------
+    sums : (p, r, m, 3) float64
+        Irradiance sums of r scrambles. With s samples, scramble i has had ⌈(s - i) / r⌉ of them.
+    samples : int
+        s.
+    active : (p,) bool
+        Probes that count.
+
+    Returns
+    -------
+    float or None
+        0.02 is 2 %. None with fewer than one sample in each scramble; 0 where everything is black.
+    """
+    r = sums.shape[1]
+    if samples < r:
+        return None
+    sums = sums[active]
+    if not sums.size:
+        return 0.0
+    drawn = np.array([-(-(samples - i) // r) for i in range(r)], np.float64)
+    means = sums / drawn[:, None, None]
+    estimate = sums.sum(1) / samples
+    # Variance of the pooled estimate: the scrambles' spread, each weighted by its share of the samples.
+    share = drawn / samples
+    spread = ((means - estimate[:, None]) ** 2 * share[:, None, None] ** 2).sum(1) * (r / (r - 1))
+    variance = spread.sum(-1)
+    square = (estimate**2).sum(-1)
+    floor = (DARK_FRACTION * float(np.sqrt(square).mean())) ** 2
+    if floor == 0:
+        return 0.0
+    per_probe = (variance / (square + floor)).mean(1)
+    mean = float(per_probe.mean())
+    if mean == 0:
+        return 0.0
+    # Each probe's figure scatters like χ² with at least r - 1 degrees of freedom (its texels share paths, so no more are claimed);
+    # Satterthwaite 1946 for their mean, Wilson and Hilferty 1931 for the quantile.
+    freedom = (r - 1) * float(per_probe.sum()) ** 2 / float((per_probe**2).sum())
+    lower = max(1 - 2 / (9 * freedom) - _Z95 * math.sqrt(2 / (9 * freedom)), 0.05) ** 3
+    return math.sqrt(mean / lower)

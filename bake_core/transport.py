@@ -1,0 +1,433 @@
+"""Unbiased path tracing: one path, from a ray to the radiance that comes back along it.
+
+Kajiya 1986, "The Rendering Equation"; next-event estimation and multiple importance sampling after Veach 1997, "Robust Monte Carlo
+Methods for Light Transport Simulation" (balance heuristic). Compiled strictly: no fastmath, so the same bits on every run.
+
+Arithmetic is float64 between queries (the queries themselves are float32): on scalars it costs nothing, and a hit point lies in its
+triangle's plane to 1e-16.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import uint64
+from numpy.typing import NDArray
+
+from bake_core import embree
+from bake_core.embree import intersect1, occluded1, set_ray
+from bake_core.kernels import kernel
+from bake_core.lights import (
+    EmitterTable,
+    LightTable,
+    choose,
+    emitter_table,
+    environment_radiance,
+    light_table,
+    merge_lights,
+    toward_light,
+)
+from bake_core.materials import INV_PI, MaterialTable, lambert_cosine, material_table, sample_lambert
+from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair, uniform_triangle
+from bake_core.scene import Lights, Scene
+from bake_core.spec import Spec
+
+# Roulette by throughput begins where a path has lost 90 % of its weight. With the chance to go on equal to throughput / τ below τ, a
+# furnace of albedo a has a relative σ of τ√a from roulette: 10 % of a path here, against 100 % where τ = 1.
+ROULETTE_THROUGHPUT = 0.1
+# Where throughput does not fall (white walls), a path that has met no light for m > 16 vertices goes on with chance (m/(m+1))². Survival
+# falls as 1/m², slower than any physical decay, so the variance stays finite; yet in a sealed dark room a path takes 32 vertices on average.
+ROULETTE_DARK_VERTICES = 16
+# The same against light that never dies away (a sealed box of albedo 1 with an emitter in it has no finite answer): late enough that no
+# path of an albedo below 0.999 gets here.
+ROULETTE_LAST_VERTICES = 8192
+# Rounding a point to float32 and intersecting in float32 each err by about an ulp of the numbers involved: leave the surface by eight.
+_EPSILON = 2.0**-20
+# Nearer to an edge than this (barycentric) a rounded point may lie beyond a wall that meets the triangle there, and a sealed room leaks.
+_INSET = 2.0**-17
+_INVALID = 0xFFFFFFFF
+_INFINITE = np.float32(np.inf)
+# Camera rays pass through back faces; this many before giving up bounds the loop on a pile of coincident ones.
+_MAX_PASSED = 256
+
+
+class Tables(NamedTuple):
+    """All that kernels read of a scene; see :class:`bake_core.scene.Scene` for the arrays. Items are mesh 0 and then the instances."""
+
+    handle: np.uint64
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    indices: NDArray[np.uint32]
+    triangle_material: NDArray[np.uint32]
+    item_first_triangle: NDArray[np.int64]
+    item_transform: NDArray[np.float64]
+    item_normal: NDArray[np.float64]
+    materials: MaterialTable
+    emitters: EmitterTable
+    lights: LightTable
+    environment: NDArray[np.float64]
+    max_bounces: np.int64
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """A scene ready to be traced; rays are given in the scene's local frame (world minus `origin`)."""
+
+    origin: NDArray[np.float64]
+    lights: Lights
+    tables: Tables
+    geometry: embree.Geometry
+    triangle_count: int
+
+    @classmethod
+    def build(cls, scene: Scene, spec: Spec) -> Tracer:
+        """Build the acceleration structure and the kernels' tables.
+
+        Raises
+        ------
+        SceneError, SpecError
+            ``*.unsupported`` for what transport does not model yet.
+        """
+        geometry = embree.Geometry(scene)
+        lights = merge_lights(scene, spec)
+        transforms = np.concatenate([np.eye(3, 4)[None], scene.instance_transform.reshape(-1, 3, 4)])
+        tables = Tables(
+            handle=np.uint64(geometry.handle),
+            positions=scene.positions,
+            normals=scene.normals,
+            colors=scene.colors,
+            indices=scene.indices,
+            triangle_material=scene.triangle_material,
+            item_first_triangle=np.concatenate([scene.mesh_first_triangle[:1], scene.mesh_first_triangle[scene.instance_mesh]]),
+            item_transform=transforms,
+            item_normal=_normal_matrices(transforms[:, :, :3]),
+            materials=material_table(scene),
+            emitters=emitter_table(scene),
+            lights=light_table(lights, scene.bounds - scene.origin),
+            environment=environment_radiance(spec),
+            max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
+        )
+        return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
+
+
+def _normal_matrices(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse transposes, up to a positive factor: the cofactor matrix times the determinant's sign, defined for singular ones too."""
+    a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], 1)
+    sign = np.where((a * cofactors[:, 0]).sum(1) < 0, -1.0, 1.0)
+    out: NDArray[np.float64] = cofactors * sign[:, None, None]
+    return out
+
+
+@kernel  # type: ignore[untyped-decorator]
+def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """What a hit found, from the RTCRayHit it left behind.
+
+    Returns
+    -------
+    point : 3 float64
+        In the triangle's plane, a hair inside its edges.
+    n : 6 float64
+        Geometric and shading normal, unit, both on the side the ray came from.
+    epsilon : float64
+        How far to leave the surface, metres.
+    color : 3 float64
+        Vertex colour.
+    material : int
+    front : bool
+    """
+    item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
+    triangle = t.item_first_triangle[item] + ray_bits[17]
+    i0, i1, i2 = t.indices[triangle, 0], t.indices[triangle, 1], t.indices[triangle, 2]
+    b1 = max(float(ray[15]), _INSET)
+    b2 = max(float(ray[16]), _INSET)
+    b0 = max(1.0 - b1 - b2, _INSET)
+    scale = 1.0 / (b0 + b1 + b2)
+    b0, b1, b2 = b0 * scale, b1 * scale, b2 * scale
+    ax, ay, az = float(t.positions[i0, 0]), float(t.positions[i0, 1]), float(t.positions[i0, 2])
+    bx, by, bz = float(t.positions[i1, 0]), float(t.positions[i1, 1]), float(t.positions[i1, 2])
+    cx, cy, cz = float(t.positions[i2, 0]), float(t.positions[i2, 1]), float(t.positions[i2, 2])
+    ex, ey, ez = bx - ax, by - ay, bz - az
+    fx, fy, fz = cx - ax, cy - ay, cz - az
+    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+    px, py, pz = b0 * ax + b1 * bx + b2 * cx, b0 * ay + b1 * by + b2 * cy, b0 * az + b1 * bz + b2 * cz
+    sx = max(abs(ax - px), abs(bx - px), abs(cx - px))
+    sy = max(abs(ay - py), abs(by - py), abs(cy - py))
+    sz = max(abs(az - pz), abs(bz - pz), abs(cz - pz))
+    moved = 0.0
+    if item:
+        m = t.item_transform[item]
+        # A transformed triangle is intersected in its own space: rounding there is relative to where that space's zero stands.
+        moved = abs(m[0, 3]) + abs(m[1, 3]) + abs(m[2, 3])
+        px, py, pz = (
+            m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3],
+            m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3],
+            m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3],
+        )
+        sx, sy, sz = (
+            abs(m[0, 0]) * sx + abs(m[0, 1]) * sy + abs(m[0, 2]) * sz,
+            abs(m[1, 0]) * sx + abs(m[1, 1]) * sy + abs(m[1, 2]) * sz,
+            abs(m[2, 0]) * sx + abs(m[2, 1]) * sy + abs(m[2, 2]) * sz,
+        )
+        k = t.item_normal[item]
+        gx, gy, gz = (
+            k[0, 0] * gx + k[0, 1] * gy + k[0, 2] * gz,
+            k[1, 0] * gx + k[1, 1] * gy + k[1, 2] * gz,
+            k[2, 0] * gx + k[2, 1] * gy + k[2, 2] * gz,
+        )
+    length = math.sqrt(gx * gx + gy * gy + gz * gz)
+    if length > 0:
+        gx, gy, gz = gx / length, gy / length, gz / length
+    else:
+        # Embree does not hit triangles without area; a prototype squashed flat by its instance can still get here.
+        gx, gy, gz = -dx, -dy, -dz
+    front = gx * dx + gy * dy + gz * dz < 0
+    nx, ny, nz = gx, gy, gz
+    if t.normals.shape[0]:
+        hx = b0 * t.normals[i0, 0] + b1 * t.normals[i1, 0] + b2 * t.normals[i2, 0]
+        hy = b0 * t.normals[i0, 1] + b1 * t.normals[i1, 1] + b2 * t.normals[i2, 1]
+        hz = b0 * t.normals[i0, 2] + b1 * t.normals[i1, 2] + b2 * t.normals[i2, 2]
+        if item:
+            k = t.item_normal[item]
+            hx, hy, hz = (
+                k[0, 0] * hx + k[0, 1] * hy + k[0, 2] * hz,
+                k[1, 0] * hx + k[1, 1] * hy + k[1, 2] * hz,
+                k[2, 0] * hx + k[2, 1] * hy + k[2, 2] * hz,
+            )
+        length = math.sqrt(hx * hx + hy * hy + hz * hz)
+        if length > 0:
+            nx, ny, nz = hx / length, hy / length, hz / length
+    if not front:
+        gx, gy, gz, nx, ny, nz = -gx, -gy, -gz, -nx, -ny, -nz
+    # What rounding can do across the plane, axis by axis: nothing for an axis-aligned wall through zero, so its offset is almost nothing.
+    across = abs(gx) * (abs(px) + sx) + abs(gy) * (abs(py) + sy) + abs(gz) * (abs(pz) + sz)
+    along = max(abs(px) + sx, abs(py) + sy, abs(pz) + sz)
+    epsilon = _EPSILON * (across + moved + along / 16)
+    red = green = blue = 1.0
+    if t.colors.shape[0]:
+        red = b0 * t.colors[i0, 0] + b1 * t.colors[i1, 0] + b2 * t.colors[i2, 0]
+        green = b0 * t.colors[i0, 1] + b1 * t.colors[i1, 1] + b2 * t.colors[i2, 1]
+        blue = b0 * t.colors[i0, 2] + b1 * t.colors[i1, 2] + b2 * t.colors[i2, 2]
+    material = t.triangle_material[triangle]
+    return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front
+
+
+@kernel  # type: ignore[untyped-decorator]
+def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
+    """Whether anything lies between a point and the light."""
+    set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
+    occluded1(t.handle, ray.ctypes.data, 0)
+    return ray[8] < 0
+
+
+@kernel  # type: ignore[untyped-decorator]
+def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-untyped-def]
+    """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
+
+    The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
+    """
+    e = t.emitters
+    i, _ = choose(e.cdf, float(w))
+    b1, b2 = uniform_triangle(u, v)
+    b0 = 1.0 - b1 - b2
+    x = b0 * e.vertices[i, 0, 0] + b1 * e.vertices[i, 1, 0] + b2 * e.vertices[i, 2, 0]
+    y = b0 * e.vertices[i, 0, 1] + b1 * e.vertices[i, 1, 1] + b2 * e.vertices[i, 2, 1]
+    z = b0 * e.vertices[i, 0, 2] + b1 * e.vertices[i, 1, 2] + b2 * e.vertices[i, 2, 2]
+    dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    d2 = dx * dx + dy * dy + dz * dz
+    if d2 <= 0:
+        return 0.0, 0.0, 0.0
+    d = math.sqrt(d2)
+    cosine = lambert_cosine(dx / d, dy / d, dz / d, n)
+    facing = -(dx * e.normal[i, 0] + dy * e.normal[i, 1] + dz * e.normal[i, 2]) / d
+    sides = 1.0
+    if e.double_sided[i]:
+        sides = 2.0
+    side = 1.0 if facing > 0 else -1.0
+    if cosine <= 0 or facing == 0 or (side < 0 and sides == 1.0):
+        return 0.0, 0.0, 0.0
+    # Both ends leave their surfaces, so that neither of them blocks.
+    lift = side * _EPSILON * (abs(x) + abs(y) + abs(z))
+    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    tx, ty, tz = x + lift * e.normal[i, 0] - ox, y + lift * e.normal[i, 1] - oy, z + lift * e.normal[i, 2] - oz
+    if blocked(t, ray, ray_bits, ox, oy, oz, tx, ty, tz, np.float32(1.0)):
+        return 0.0, 0.0, 0.0
+    weight = e.radiance[i, 0] + e.radiance[i, 1] + e.radiance[i, 2]
+    pdf_light = weight * sides / e.total * d2 / (facing * side)
+    gain = cosine * INV_PI / (pdf_light + cosine * INV_PI)
+    return gain * e.radiance[i, 0], gain * e.radiance[i, 1], gain * e.radiance[i, 2]
+
+
+@kernel  # type: ignore[untyped-decorator]
+def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-def]
+    """Light from one punctual or directional light, chosen by weight: Σ f cosθ E over albedo, unbiased."""
+    i, chance = choose(t.lights.cdf, float(u))
+    wx, wy, wz, distance, gain = toward_light(t.lights, i, p[0], p[1], p[2])
+    cosine = lambert_cosine(wx, wy, wz, n)
+    if gain <= 0 or cosine <= 0:
+        return 0.0, 0.0, 0.0
+    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    if blocked(t, ray, ray_bits, ox, oy, oz, wx, wy, wz, np.float32(distance)):
+        return 0.0, 0.0, 0.0
+    gain *= cosine * INV_PI / chance
+    return gain * t.lights.value[i, 0], gain * t.lights.value[i, 1], gain * t.lights.value[i, 2]
+
+
+@kernel  # type: ignore[untyped-decorator]
+def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: ignore[no-untyped-def]
+    """Nearest hit; with `through_backs`, back faces of single-sided materials are passed, as a rasteriser that culls them does.
+
+    Returns (hit, surface). Without a hit the surface means nothing.
+    """
+    for _ in range(_MAX_PASSED):
+        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE)
+        intersect1(t.handle, ray.ctypes.data, 0)
+        if ray_bits[18] == _INVALID:
+            break
+        s = surface(t, ray_bits, ray, dx, dy, dz)
+        if s[5] or not through_backs or t.materials.double_sided[s[4]]:
+            return True, s
+        # Leave on the far side: the surface's normal looks back at us.
+        ox, oy, oz = s[0][0] - s[2] * s[1][0], s[0][1] - s[2] * s[1][1], s[0][2] - s[2] * s[1][2]
+    zero = 0.0
+    return False, ((zero, zero, zero), (zero, zero, zero, zero, zero, zero), zero, (zero, zero, zero), t.triangle_material.dtype.type(0), True)
+
+
+@kernel  # type: ignore[untyped-decorator]
+def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera):  # type: ignore[no-untyped-def]
+    """One path.
+
+    Parameters
+    ----------
+    t : Tables
+    ray, ray_bits : (24,) float32, the same as uint32
+        An aligned RTCRayHit to work in.
+    ox … dz : float
+        The ray, local frame; unit direction.
+    reversed_index, index, key
+        Sample point: its index within its scramble, with bits reversed and plain, and what picks the scramble.
+    camera : bool
+        Pass through back faces on the first ray.
+
+    Returns
+    -------
+    emitted : 3 float64
+        Radiance of what the ray itself meets: an emitter, the environment.
+    direct : 3 float64
+        Reflected at the first surface straight from punctual and directional lights.
+    indirect : 3 float64
+        Reflected at the first surface, all the rest.
+    hit : bool
+        Whether the ray met a surface.
+    """
+    emitted_r = emitted_g = emitted_b = 0.0
+    direct_r = direct_g = direct_b = 0.0
+    indirect_r = indirect_g = indirect_b = 0.0
+    # Throughput of the materials alone, and what roulette has left of survival: their quotient is the path's weight.
+    beta_r = beta_g = beta_b = 1.0
+    survival = 1.0
+    by_throughput = 1.0
+    dark = 0
+    pdf = 0.0
+    hit_any = False
+    depth = 0
+    has_emitters = t.emitters.cdf.shape[0] > 0
+    has_lights = t.lights.cdf.shape[0] > 0
+    while True:
+        hit, s = find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, camera and depth == 0)
+        if not hit:
+            # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
+            if depth == 0:
+                emitted_r, emitted_g, emitted_b = t.environment[0], t.environment[1], t.environment[2]
+            else:
+                indirect_r += beta_r / survival * t.environment[0]
+                indirect_g += beta_g / survival * t.environment[1]
+                indirect_b += beta_b / survival * t.environment[2]
+            break
+        p, n, epsilon, color, material, front = s
+        two_sided = t.materials.double_sided[material]
+        if depth == 0:
+            hit_any = True
+        if not front and not two_sided:
+            break
+        dark += 1
+        le_r, le_g, le_b = (
+            float(t.materials.emission[material, 0]),
+            float(t.materials.emission[material, 1]),
+            float(t.materials.emission[material, 2]),
+        )
+        strength = le_r + le_g + le_b
+        if strength > 0:
+            dark = 0
+            if depth == 0:
+                emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
+            else:
+                hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
+                facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
+                sides = 2.0 if two_sided else 1.0
+                pdf_light = strength * sides / t.emitters.total * (hx * hx + hy * hy + hz * hz) / max(facing, 1e-30)
+                gain = pdf / (pdf + pdf_light) / survival
+                indirect_r += beta_r * gain * le_r
+                indirect_g += beta_g * gain * le_g
+                indirect_b += beta_b * gain * le_b
+        if depth >= t.max_bounces:
+            break
+        beta_r *= float(t.materials.albedo[material, 0]) * color[0]
+        beta_g *= float(t.materials.albedo[material, 1]) * color[1]
+        beta_b *= float(t.materials.albedo[material, 2]) * color[2]
+        most = max(beta_r, beta_g, beta_b)
+        if most <= 0:
+            break
+        depth += 1
+        vertex = key + uint64(depth) * uint64(0xD1B54A32D192ED03)
+        if depth <= STRATIFIED_VERTICES:
+            bsdf_u, bsdf_v = sobol_pair(reversed_index, vertex)
+            choice, roulette = sobol_pair(reversed_index, vertex + uint64(1))
+        else:
+            bsdf_u, bsdf_v = random_pair(index, vertex)
+            choice, roulette = random_pair(index, vertex + uint64(1))
+        if has_emitters:
+            if depth <= STRATIFIED_VERTICES:
+                light_u, light_v = sobol_pair(reversed_index, vertex + uint64(2))
+            else:
+                light_u, light_v = random_pair(index, vertex + uint64(2))
+            r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, light_u, light_v, choice)
+            if r + g + b > 0:
+                dark = 0
+                indirect_r += beta_r / survival * r
+                indirect_g += beta_g / survival * g
+                indirect_b += beta_b / survival * b
+        if has_lights:
+            # Emitters and punctual lights may share a number: each sum stays unbiased, and no product of the two is taken.
+            r, g, b = from_lights(t, ray, ray_bits, p, n, epsilon, choice)
+            if r + g + b > 0:
+                dark = 0
+                if depth == 1:
+                    direct_r, direct_g, direct_b = beta_r * r, beta_g * g, beta_b * b
+                else:
+                    indirect_r += beta_r / survival * r
+                    indirect_g += beta_g / survival * g
+                    indirect_b += beta_b / survival * b
+        go_on = 1.0
+        if most < ROULETTE_THROUGHPUT:
+            go_on = most / ROULETTE_THROUGHPUT / by_throughput
+            by_throughput = most / ROULETTE_THROUGHPUT
+        if dark > ROULETTE_DARK_VERTICES:
+            go_on *= ((dark - 1.0) / dark) ** 2
+        if depth > ROULETTE_LAST_VERTICES:
+            go_on *= ((depth - 1.0) / depth) ** 2
+        if go_on < 1:
+            if roulette >= go_on:
+                break
+            survival *= go_on
+        dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
+        pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+        ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any
+
+
+
