@@ -1,0 +1,128 @@
+"""The GLSL module on lavapipe: against the numpy twin, against the fixtures, and its octahedral map against float64."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bake_core import irradiance
+from bake_core.bundle import VolumeData
+from bake_core.octahedral import dir_to_oct, oct_to_dir
+from bake_core.probe_textures import probe_module, probe_textures
+from bake_core.shader_compiler import compile_glsl, shader_text
+from bake_core.vulkan import Bindings, Device, compute_pipeline, storage
+from tests import compile_shaders
+from tests.conformance import synthetic
+
+HEADER = """#version 450
+layout(local_size_x = 64) in;
+layout(set = 0, binding = 0) readonly buffer Inputs { vec4 inputs[]; };
+layout(set = 0, binding = 1) writeonly buffer Outputs { vec4 outputs[]; };
+layout(push_constant) uniform Push { int count; };
+"""
+QUERY = """
+void main() {
+    int i = int(gl_GlobalInvocationID.x);
+    if (i < count) {
+        vec3 position = inputs[3 * i].xyz;
+        int v = obSelectVolume(position);
+        outputs[i] = vec4(obIrradiance(position, inputs[3 * i + 1].xyz, inputs[3 * i + 2].xyz), float(v));
+    }
+}
+"""
+OCTAHEDRAL = """
+void main() {
+    int i = int(gl_GlobalInvocationID.x);
+    if (i < count) {
+        vec2 p = obDirToOct(inputs[i].xyz);
+        outputs[2 * i] = vec4(p, 0.0, 0.0);
+        outputs[2 * i + 1] = vec4(obOctToDir(p), 0.0);
+    }
+}
+"""
+
+
+def run(source: str, inputs: Sequence[NDArray[np.float64]], rows: int, volumes: Sequence[VolumeData] = ()) -> NDArray[np.float32]:
+    """Run a compute shader over n items of several vec4 each; (n, rows, 4)."""
+    n = len(inputs[0])
+    packed = np.zeros((n, len(inputs), 4), np.float32)
+    packed[..., :3] = np.stack(inputs, 1)
+    with Device() as device:
+        source_buffer, result = storage(device, packed), storage(device, n * rows * 16)
+        bindings = Bindings(device, [source_buffer, result, *probe_textures(device, volumes)])
+        pipeline = compute_pipeline(device, compile_glsl(source, "comp", "test"), bindings)
+        device.run(lambda commands: commands.dispatch(pipeline, (n + 63) // 64, np.int32(n).tobytes()))
+        return result.read(np.float32, (n, rows, 4))
+
+
+def query(volumes: Sequence[VolumeData], *points: NDArray[np.float64]) -> NDArray[np.float32]:
+    return run(HEADER + probe_module(volumes, 2) + QUERY, points, 1, volumes)[:, 0]
+
+
+def test_the_irradiance_query_agrees_with_its_numpy_twin() -> None:
+    volumes = synthetic.volumes()
+    points = synthetic.points(20000)
+    found = query(volumes, *points)
+    expected = irradiance.sample(volumes, *points)
+    # Volumes meet no point of the set at their borders but exactly, where both sides decide alike.
+    np.testing.assert_array_equal(found[:, 3], expected.volume)
+    difference = np.abs(found[:, :3] - expected.irradiance).max(-1)
+    brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
+    assert np.isfinite(found).all()
+    assert difference.max() < 2e-5 * brightest, f"worst at {points[0][difference.argmax()]}"
+
+
+def test_the_irradiance_query_agrees_with_the_fixtures() -> None:
+    data = json.loads((Path(__file__).parents[1] / "conformance" / "irradiance.json").read_text(encoding="utf-8"))
+    columns = {k: np.array([row[k] for row in data["queries"]]) for k in ("position", "normal", "wo", "irradiance", "volume")}
+    found = query(synthetic.volumes(), columns["position"], columns["normal"], columns["wo"])
+    np.testing.assert_array_equal(found[:, 3], columns["volume"])
+    np.testing.assert_allclose(found[:, :3], columns["irradiance"], atol=4e-5)
+
+
+def test_one_volume_is_enough() -> None:
+    volume = synthetic.volume("alone", (0, 0, 0), (1, 1, 1), (1, 1, 1), seed=9)
+    _, normals, wo = synthetic.points(50)
+    found = query((volume,), normals * 0.3, normals, wo)
+    expected = irradiance.sample((volume,), normals * 0.3, normals, wo)
+    np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
+
+
+def test_the_octahedral_map_keeps_directions_to_half_a_millionth() -> None:
+    """A million directions, and the hard ones: axes, fold lines, zeros of both signs, a hair beside them."""
+    z = 1 - 2 * (np.arange(1_000_000) + 0.5) / 1_000_000
+    angle = np.arange(1_000_000) * np.pi * (3 - np.sqrt(5))
+    spiral = np.stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z], -1)
+    zeros = np.array([0.0, -0.0, 1e-7, -1e-7, 1e-30, -1e-30])
+    hairs = np.array([(x, y, s) for x in zeros for y in zeros for s in (1.0, -1.0)])
+    hard = np.concatenate([synthetic.DIRECTIONS, hairs, hairs[:, [0, 2, 1]], hairs[:, [2, 0, 1]]])
+    directions = np.concatenate([spiral, hard / np.linalg.norm(hard, axis=-1, keepdims=True)]).astype(np.float32).astype(np.float64)
+    found = run(HEADER + shader_text("octahedral.glsl") + OCTAHEDRAL, [directions], 2).astype(np.float64)
+    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    decoded = found[:, 1, :3] / np.linalg.norm(found[:, 1, :3], axis=-1, keepdims=True)
+    # The cross product, not the scalar one: an arc cosine near 1 cannot tell 1e-7 from 0.
+    assert np.linalg.norm(np.cross(unit, decoded), axis=-1).max() < 5e-7
+    assert ((unit * decoded).sum(-1) > 0).all()
+    encoded = found[:, 0, :2]
+    # On the square's edge a point and its mirror image are one direction, so compare what they decode to.
+    np.testing.assert_allclose(oct_to_dir(encoded), oct_to_dir(dir_to_oct(unit)), atol=5e-7)
+    assert np.abs(encoded).max() <= 1
+
+
+def test_the_module_compiles_for_both_targets() -> None:
+    assert compile_shaders.main() == 0
+
+
+def test_a_broken_shader_is_an_error_that_says_where() -> None:
+    from bake_core.errors import BakeError
+
+    with pytest.raises(BakeError, match="undeclared") as caught:
+        compile_glsl("#version 450\nvoid main() {\n    missing = 1;\n}\n", "frag", "broken.frag")
+    assert caught.value.slug == "shaders.invalid"
+    assert caught.value.message.startswith("3:")
+    assert caught.value.where == "broken.frag"
