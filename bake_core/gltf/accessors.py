@@ -98,16 +98,19 @@ class Accessors:
         Raises
         ------
         SceneError
-            ``gltf.bad_accessor``; ``gltf.primitive_restart`` where the type's largest value occurs, which glTF forbids.
+            ``gltf.primitive_restart`` where the type's largest value occurs, which glTF forbids.
         """
-        accessor = self._require(index, INDICES, where)
-        if accessor.view is not None and self._views[accessor.view].stride:
-            fail("bad_stride", f"indices must be tightly packed, but {self._views[accessor.view].fields.where} has a byteStride", where)
-        values: NDArray[np.unsignedinteger] = self._read(accessor)[:, 0]
+        values: NDArray[np.unsignedinteger] = self._read(self._all[index])[:, 0]
         restart = np.iinfo(values.dtype).max
         if values.max() == restart:
             fail("primitive_restart", f"has the value {restart}, which glTF does not allow (primitive restart)", where)
         return values
+
+    def check_indices(self, index: int, where: str) -> None:
+        """Refuse an accessor that cannot be a list of indices."""
+        view = self._require(index, INDICES, where).view
+        if view is not None and self._views[view].stride:
+            fail("bad_stride", f"indices must be tightly packed, but {self._views[view].fields.where} has a byteStride", where)
 
     def check_attribute(self, index: int, semantic: str, where: str) -> None:
         """Refuse an accessor whose type the attribute's semantic does not allow."""
@@ -134,6 +137,7 @@ class Accessors:
         return self._floats[index]
 
     def _require(self, index: int, rule: Rule, where: str) -> Accessor:
+        """The accessor, if its type is right and it has data."""
         a = self._all[index]
         if a.kind not in rule.types or (a.component, a.normalized) not in rule.components:
             given = f"{a.kind} of {'normalised ' if a.normalized else ''}{COMPONENT_NAMES[a.component]}"

@@ -116,6 +116,8 @@ def _check_primitive(p: Fields, accessors: Accessors, materials: int, notes: Not
         if name not in ("POSITION", "NORMAL", "COLOR_0"):
             notes.add(f"vertex attribute {quoted(name)}", p.where)
     indices = p.index("indices", len(accessors), "accessors")
+    if indices is not None:
+        accessors.check_indices(indices, p.place("indices"))
     material = p.index("material", materials, "materials")
     mode = p.integer("mode", default=TRIANGLES, high=6)
     corners = vertices if indices is None else accessors.count(indices)
@@ -212,7 +214,8 @@ def _unit(vectors: F32) -> F32:
     """Unit vectors; zero stays zero."""
     wide = vectors.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
-    return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0).astype(np.float32)
+    unit: F64 = np.divide(wide, length, out=np.zeros_like(wide), where=length > 0)
+    return unit.astype(np.float32)
 
 
 def _rgba(colors: F32) -> F32:

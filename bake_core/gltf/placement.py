@@ -77,11 +77,14 @@ def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], no
         vertices = meshes[m].positions.astype(np.float64)
         centre = _box(vertices).mean(axis=0)
         vertices -= centre
-        _check_range(_box(vertices), f"meshes[{m}]")
-        boxes.append(_instances_box(vertices, transform[mine], centre))
-        _check_range(boxes[-1], f"meshes[{m}]")
+        extent = _box(vertices)
+        _check_range(extent, f"meshes[{m}]")
+        with np.errstate(over="ignore", invalid="ignore"):
+            transform[mine, :, 3] += transform[mine, :, :3] @ centre
+            reach = np.abs(transform[mine, :, 3]) + np.abs(transform[mine, :, :3]) @ extent[1]
+        _check_range(reach.max(axis=0), nodes.place(int(node[instanced][mine][np.argmax(reach.max(axis=1))])))
+        boxes.append(_instances_box(vertices, transform[mine]))
         centred.append(_moved(meshes[m], vertices))
-        transform[mine, :, 3] += transform[mine, :, :3] @ centre
 
     bounds = np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)]) if boxes else np.zeros((2, 3))
     # Adding 0 turns -0 into 0: these two are read by people.
@@ -153,15 +156,13 @@ def _check_range(box: F64, where: str) -> None:
         fail("overflow", f"puts vertices beyond {MAX_COORDINATE:g} m, where float32 ray tracing ends", where)
 
 
-def _instances_box(vertices: F64, transform: F64, centre: F64) -> F64:
-    """World box of all instances of a prototype whose vertices were moved by -`centre`."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        offset = transform[:, :, 3] + transform[:, :, :3] @ centre
-        box = np.empty((2, 3))
-        for axis in range(3):
-            rows = transform[:, axis, :3]
-            box[0, axis] = -_furthest(vertices, -rows, -offset[:, axis])
-            box[1, axis] = _furthest(vertices, rows, offset[:, axis])
+def _instances_box(vertices: F64, transform: F64) -> F64:
+    """World box of all instances of one prototype."""
+    box = np.empty((2, 3))
+    for axis in range(3):
+        rows, offset = transform[:, axis, :3], transform[:, axis, 3]
+        box[0, axis] = -_furthest(vertices, -rows, -offset)
+        box[1, axis] = _furthest(vertices, rows, offset)
     return box
 
 
@@ -172,8 +173,6 @@ def _furthest(vertices: F64, rows: F64, offset: F64) -> float:
     """
     low, high = _box(vertices)
     bound = np.where(rows > 0, rows * high, rows * low).sum(axis=1) + offset
-    if not np.isfinite(bound).all():
-        return np.inf
     reach: dict[bytes, float] = {}
     best = -np.inf
     for i in np.argsort(-bound, kind="stable").tolist():
