@@ -7,14 +7,19 @@ the centre of each texel of their own map.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.embree import new_rayhit
+from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel
-from bake_core.octahedral import texel_directions
+from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.transport import Tracer, find_hit, trace_path
 
@@ -23,12 +28,16 @@ F64 = NDArray[np.float64]
 
 # Independent scrambles of every sample sequence. Their spread is the bake's error: Sobol' points themselves are not independent.
 SCRAMBLES = 4
+# A probe's capture texels are summed in this many blocks, which threads may share: fixed, so that sums are the same bits for any number of threads.
+BLOCKS = 4
+# Paths a thread traces before it asks for more: a few hundred milliseconds' work.
+_CHUNK_PATHS = 1 << 18
 _CANCELLED, _DONE = 1, 0
 
 
 @entry_kernel  # type: ignore[untyped-decorator]
-def _capture_kernel(t, ray, positions, ids, first, end, resolution, normals, seed, cancelled, lanes, irradiance, radiance):  # type: ignore[no-untyped-def]
-    """Trace samples [first, end) through every capture texel of every given probe.
+def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, normals, cosines, seed, cancelled, lanes, irradiance, radiance):  # type: ignore[no-untyped-def]
+    """Trace samples [first, end) through the capture texels of some blocks of every given probe.
 
     Parameters
     ----------
@@ -37,15 +46,28 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, normals, see
         What makes each probe's samples its own: its number in the bake, not in the shard.
     normals : (3, m) float32
         Directions of the irradiance texels' normals.
-    irradiance : (p, SCRAMBLES, m, 3) float64, added to
-        Σ L cosθ · (solid angle per sample), per scramble.
+    cosines : (resolution², m) float32
+        Exact ∫ cosθ dω over each capture texel about each normal.
+    blocks : (int, int)
+        Half-open range out of BLOCKS.
+    lanes : (4, m) float32
+        Room to work in.
+    irradiance : (p, BLOCKS, SCRAMBLES, m, 3) float64, added to
+        Σ L cosθ · (solid angle per sample), per block and scramble.
     radiance : (p, resolution², 3) float64 or (0, 0, 0), added to
         Σ L per capture texel.
 
     Notes
     -----
     A point of the octahedral square stands for dω = dA / |v|³, v being its point on the octahedron |x| + |y| + |z| = 1: a face lies 1/√3 from
-    the centre and is √3 times its projection. The cosine is taken at each sample's own direction, so the convolution has no texel size in it.
+    the centre and is √3 times its projection.
+
+    A texel's part of irradiance is ∫ L f, with f = cosθ dω/dA, over its area. With F = ∫ f known exactly it is estimated from N samples as
+
+        mean(L) F + N/(N-1) (mean(L f) - mean(L) mean(f)),
+
+    the convolution with exact texel integrals plus the sample covariance of radiance and cosine inside the texel. Both terms are unbiased: no
+    texel size is left in the result, and where L is constant it is exact at any N (a furnace tests it). With one sample only the first is there.
     """
     ray_bits = ray.view(np.uint32)
     m = normals.shape[1]
@@ -53,16 +75,18 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, normals, see
     for p in range(positions.shape[0]):
         x0, y0, z0 = positions[p, 0], positions[p, 1], positions[p, 2]
         probe_key = mix64(seed ^ mix64(ids[p]))
-        for texel in range(texels):
+        for texel in range(texels * blocks[0] // BLOCKS, texels * blocks[1] // BLOCKS):
             if cancelled[0]:
                 return _CANCELLED
             row, column = texel // resolution, texel % resolution
+            block = texel * BLOCKS // texels
             for scramble in range(SCRAMBLES):
                 key = mix64(probe_key + uint64(texel * SCRAMBLES + scramble))
                 for i in range(m):
-                    lanes[0, i] = lanes[1, i] = lanes[2, i] = np.float32(0)
+                    lanes[0, i] = lanes[1, i] = lanes[2, i] = lanes[3, i] = np.float32(0)
                 total_r = total_g = total_b = 0.0
-                # The first sample of this scramble at or after `first`.
+                count = 0
+                # From the first sample of this scramble at or after `first`.
                 for sample in range(first + (scramble - first) % SCRAMBLES, end, SCRAMBLES):
                     index = uint32(sample // SCRAMBLES)
                     reversed_index = reverse_bits(index)
@@ -84,19 +108,25 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, normals, see
                     total_r += red
                     total_g += green
                     total_b += blue
-                    if red + green + blue > 0:
-                        solid_angle = 4 / (length * length * length) / texels
-                        fr, fg, fb = np.float32(red * solid_angle), np.float32(green * solid_angle), np.float32(blue * solid_angle)
-                        fx, fy, fz = np.float32(dx), np.float32(dy), np.float32(dz)
-                        for i in range(m):
-                            cosine = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
-                            lanes[0, i] += cosine * fr
-                            lanes[1, i] += cosine * fg
-                            lanes[2, i] += cosine * fb
-                for i in range(m):
-                    irradiance[p, scramble, i, 0] += lanes[0, i]
-                    irradiance[p, scramble, i, 1] += lanes[1, i]
-                    irradiance[p, scramble, i, 2] += lanes[2, i]
+                    count += 1
+                    solid_angle = np.float32(4 / (length * length * length) / texels)
+                    fr, fg, fb = np.float32(red), np.float32(green), np.float32(blue)
+                    fx, fy, fz = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
+                    for i in range(m):
+                        f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
+                        lanes[0, i] += f * fr
+                        lanes[1, i] += f * fg
+                        lanes[2, i] += f * fb
+                        lanes[3, i] += f
+                if count and total_r + total_g + total_b > 0:
+                    mean_r, mean_g, mean_b = np.float32(total_r / count), np.float32(total_g / count), np.float32(total_b / count)
+                    bessel = np.float32(count / (count - 1) if count > 1 else 0.0)
+                    weight = np.float32(count)
+                    for i in range(m):
+                        exact = weight * cosines[texel, i]
+                        irradiance[p, block, scramble, i, 0] += mean_r * exact + bessel * (lanes[0, i] - mean_r * lanes[3, i])
+                        irradiance[p, block, scramble, i, 1] += mean_g * exact + bessel * (lanes[1, i] - mean_g * lanes[3, i])
+                        irradiance[p, block, scramble, i, 2] += mean_b * exact + bessel * (lanes[2, i] - mean_b * lanes[3, i])
                 if radiance.shape[0]:
                     radiance[p, texel, 0] += total_r
                     radiance[p, texel, 1] += total_g
@@ -126,65 +156,136 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
     return _DONE
 
 
+@dataclass(frozen=True)
+class Capture:
+    """What is captured, the same for all probes of a bake.
+
+    Attributes
+    ----------
+    resolution, irradiance_resolution : int
+        Texels along the capture map's and the irradiance map's side.
+    seed : int
+    keep_radiance : bool
+    """
+
+    resolution: int
+    irradiance_resolution: int
+    seed: int
+    keep_radiance: bool
+
+
 def capture_radiance(
     tracer: Tracer,
     positions: F64,
     ids: NDArray[np.uint64],
     samples: tuple[int, int],
+    capture: Capture,
     *,
-    resolution: int,
-    irradiance_resolution: int,
-    seed: int,
-    keep_radiance: bool,
+    threads: int,
     cancelled: NDArray[np.uint8],
-) -> tuple[F64, F64] | None:
-    """Sums over a range of samples for some probes; releases the GIL.
+    advance: Callable[[float], None],
+) -> tuple[F64, F64]:
+    """Sums over a range of samples for some probes, on several threads.
 
     Parameters
     ----------
     positions : (p, 3) float64
         Metres, local frame.
     ids : (p,) uint64
+        A probe's number in the bake: makes its samples its own, in whatever shard it is traced.
     samples : (int, int)
         Half-open range. Sample s belongs to scramble s % SCRAMBLES.
-    resolution, irradiance_resolution : int
-        Texels along the capture map's and the irradiance map's side.
     cancelled : (1,) uint8
         Set it from any thread to stop within one texel.
+    advance : callable
+        Told the fraction of the work that has been done since it was last called.
 
     Returns
     -------
     irradiance : (p, SCRAMBLES, irradiance_resolution², 3) float64
         Sums; over the samples of a scramble they give irradiance, no 1/π inside.
     radiance : (p, resolution², 3) float64
-        Sums over all samples; (0, 0, 0) unless `keep_radiance`.
-    None where it was cancelled.
+        Sums over all samples; (0, 0, 0) unless it is kept.
+
+    Raises
+    ------
+    Cancelled
     """
-    normals = np.ascontiguousarray(texel_directions(irradiance_resolution).reshape(-1, 3).T, dtype=np.float32)
-    irradiance = np.zeros((len(positions), SCRAMBLES, normals.shape[1], 3))
-    radiance = np.zeros((len(positions), resolution**2, 3) if keep_radiance else (0, 0, 0))
-    status = _capture_kernel(
-        tracer.tables,
-        new_rayhit(),
-        np.ascontiguousarray(positions),
-        ids,
-        samples[0],
-        samples[1],
-        resolution,
-        normals,
-        np.uint64(seed),
-        cancelled,
-        np.zeros_like(normals),
-        irradiance,
-        radiance,
-    )
-    return None if status == _CANCELLED else (irradiance, radiance)
+    normals, cosines = _irradiance_filter(capture.resolution, capture.irradiance_resolution)
+    n = len(positions)
+    irradiance = np.zeros((n, SCRAMBLES, normals.shape[1], 3))
+    radiance = np.zeros((n, capture.resolution**2, 3) if capture.keep_radiance else (0, 0, 0))
+
+    def trace(first: int, end: int, blocks: tuple[int, int]) -> F64:
+        sums = np.zeros((end - first, BLOCKS, *irradiance.shape[1:]))
+        status = _capture_kernel(
+            tracer.tables,
+            new_rayhit(),
+            positions[first:end],
+            ids[first:end],
+            *samples,
+            capture.resolution,
+            blocks,
+            normals,
+            cosines,
+            np.uint64(capture.seed),
+            cancelled,
+            np.zeros((4, normals.shape[1]), np.float32),
+            sums,
+            radiance[first:end],
+        )
+        if status == _CANCELLED:
+            raise Cancelled
+        return sums
+
+    def trace_probes(first: int, end: int) -> None:
+        irradiance[first:end] = _sum_blocks(trace(first, end, (0, BLOCKS)))
+        advance((end - first) / n)
+
+    def trace_block(block: int) -> F64:
+        sums = trace(0, n, (block, block + 1))
+        advance(1 / BLOCKS)
+        return sums[:, block]
+
+    with ThreadPoolExecutor(threads) as pool:
+        if n < 4 * threads:
+            # Too few probes to share out: share each probe's blocks.
+            irradiance[:] = _sum_blocks(np.stack(list(pool.map(trace_block, range(BLOCKS))), 1))
+        else:
+            # Small enough that threads end together, large enough that Python's part is nothing.
+            step = max(1, min(n // (8 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(samples[1] - samples[0], 1))))
+            starts = range(0, n, step)
+            for _ in pool.map(lambda first: trace_probes(first, min(first + step, n)), starts):
+                pass
+    return irradiance, radiance
 
 
-def capture_distance(
-    tracer: Tracer, positions: F64, resolution: int, *, cancelled: NDArray[np.uint8]
-) -> tuple[F64, F32, NDArray[np.bool_]] | None:
+@cache
+def _irradiance_filter(resolution: int, irradiance_resolution: int) -> tuple[F32, F32]:
+    """The irradiance texels' normals, (3, m) float32, and the exact cosine integrals of the capture texels about them, (resolution², m)."""
+    normals = texel_directions(irradiance_resolution).reshape(-1, 3)
+    cosines = texel_cosines(resolution, normals)
+    return np.ascontiguousarray(normals.T, dtype=np.float32), np.ascontiguousarray(cosines.T, dtype=np.float32)
+
+
+def _sum_blocks(sums: F64) -> F64:
+    """In one fixed order."""
+    total: F64 = sums[:, 0]
+    for block in range(1, BLOCKS):
+        total = total + sums[:, block]
+    return total
+
+
+def capture_distance(tracer: Tracer, positions: F64, resolution: int, *, cancelled: NDArray[np.uint8]) -> tuple[F64, F32, NDArray[np.bool_]]:
     """Distances, normals and back faces through texel centres; releases the GIL.
+
+    Parameters
+    ----------
+    positions : (p, 3) float64
+        Metres, local frame.
+    resolution : int
+        Texels along the map's side.
+    cancelled : (1,) uint8
 
     Returns
     -------
@@ -194,11 +295,15 @@ def capture_distance(
         Geometric, unit, towards the probe; zeros for a miss.
     back : (p, resolution²) bool
         Back face of a single-sided surface.
-    None where it was cancelled.
+
+    Raises
+    ------
+    Cancelled
     """
     directions = texel_directions(resolution).reshape(-1, 3)
     n = len(directions)
     distance, normal = np.empty((len(positions), n)), np.empty((len(positions), n, 3), np.float32)
     back = np.empty((len(positions), n), np.bool_)
-    status = _distance_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), directions, cancelled, distance, normal, back)
-    return None if status == _CANCELLED else (distance, normal, back)
+    if _distance_kernel(tracer.tables, new_rayhit(), positions, directions, cancelled, distance, normal, back) == _CANCELLED:
+        raise Cancelled
+    return distance, normal, back

@@ -9,6 +9,7 @@ Quadrature": replicates of a scrambled sequence are independent and unbiased). D
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +26,8 @@ DARK_FRACTION = 0.05
 _Z95 = 1.6448536269514722
 # The first pass; each later one doubles the samples.
 FIRST_SAMPLES = 16
+# A pass that a time limit shortens is a multiple of this: each scramble gets as many samples.
+SMALLEST_PASS = 4
 
 Verdict = Literal["continue", "target", "samples", "time"]
 
@@ -41,6 +44,31 @@ class Point:
 def next_pass(stop: Stop, samples: int) -> tuple[int, int]:
     """The half-open range of samples of the pass after `samples` are done: 16, 32, 64, … up to the spec's maximum."""
     return samples, min(max(FIRST_SAMPLES, 2 * samples), stop.max_samples)
+
+
+def fit_pass(stop: Stop, samples: tuple[int, int], curve: Sequence[Point], seconds: float) -> tuple[int, int]:
+    """Shorten a pass so that it ends within the spec's time limit, judged by how long samples have taken so far.
+
+    Parameters
+    ----------
+    samples : (int, int)
+        From :func:`next_pass`.
+    curve : sequence of Point
+        Passes so far.
+    seconds : float
+        Since the bake began.
+
+    Returns
+    -------
+    (int, int)
+        Empty (start equals end) where not even one round of :data:`SMALLEST_PASS` samples fits.
+    """
+    if stop.max_seconds is None or not curve:
+        return samples
+    before = curve[-2] if len(curve) > 1 else Point(0, 0.0, None)
+    per_sample = (curve[-1].seconds - before.seconds) / (curve[-1].samples - before.samples)
+    fitting = int(max(stop.max_seconds - seconds, 0) / max(per_sample, 1e-9)) // SMALLEST_PASS * SMALLEST_PASS
+    return samples[0], samples[0] + min(samples[1] - samples[0], fitting)
 
 
 def decide(stop: Stop, samples: int, error: float | None, seconds: float) -> Verdict:

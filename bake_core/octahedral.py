@@ -117,6 +117,51 @@ def texel_solid_angles(n: int) -> F64:
     return total
 
 
+def texel_cosines(n: int, normals: F64) -> F64:
+    """Exact integrals of the clamped cosine over an n×n map's texels (n even): ∫ max(0, normal·ω) dω; they sum to π.
+
+    Lambert 1760, "Photometria": over a spherical polygon the cosine's integral is half the sum, over edges, of arc length times the
+    cosine between the normal and the edge's plane. Polygons are clipped at the normal's horizon first.
+
+    Parameters
+    ----------
+    n : int
+    normals : (m, 3) float64
+        Unit.
+
+    Returns
+    -------
+    (m, n²) float64
+    """
+    corners = texel_triangles(n).reshape(-1, 3, 3)
+    out = np.empty((len(normals), n * n))
+    for row, normal in enumerate(normals):
+        height = corners @ normal
+        total = np.zeros(len(corners))
+        leaves, enters = np.zeros((len(corners), 3)), np.zeros((len(corners), 3))
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            u, v, hu, hv = corners[:, a], corners[:, b], height[:, a, None], height[:, b, None]
+            crossing = u * np.abs(hv) + v * np.abs(hu)
+            crossing /= np.maximum(np.linalg.norm(crossing, axis=1, keepdims=True), 1e-300)
+            start, end = np.where(hu >= 0, u, crossing), np.where(hv >= 0, v, crossing)
+            total += np.where((hu >= 0) | (hv >= 0), _arc(start, end, normal)[:, None], 0)[:, 0]
+            leaves += np.where((hu >= 0) & (hv < 0), crossing, 0)
+            enters += np.where((hu < 0) & (hv >= 0), crossing, 0)
+        # The piece of horizon between where the outline leaves and where it comes back.
+        along = (np.cross(leaves, enters) * normal).sum(1)
+        total += np.arctan2(along, (leaves * enters).sum(1))
+        out[row] = np.abs(total / 2).reshape(-1, 2).sum(1)
+    return out
+
+
+def _arc(u: F64, v: F64, normal: F64) -> F64:
+    """Length of the arc from u to v times the cosine between its plane's normal and `normal`."""
+    plane = np.cross(u, v)
+    sine = np.linalg.norm(plane, axis=1)
+    out: F64 = np.arctan2(sine, (u * v).sum(1)) * (plane @ normal) / np.maximum(sine, 1e-300)
+    return out
+
+
 def with_border(interior: NDArray[np.floating]) -> NDArray[np.floating]:
     """Tiles with a 1-texel border that wraps octahedrally, so that bilinear filtering never leaves a tile.
 

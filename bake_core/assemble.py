@@ -1,0 +1,186 @@
+"""From what was gathered to the files of a bundle: normalise, pack, choose encodings, write, and say all of it in the manifest."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.atlas import Layout, choose_encoding, layout, pack
+from bake_core.bundle import CHANNELS, FORMAT, SHADERS, VERSION, Atlas, VolumeData, digest_file
+from bake_core.capture import SCRAMBLES
+from bake_core.convergence import Verdict
+from bake_core.embree import instruction_set
+from bake_core.errors import BakeError
+from bake_core.filtering import VISIBILITY_SHARPNESS
+from bake_core.images import write_exr
+from bake_core.placement import Volume
+from bake_core.scene import Scene
+from bake_core.selection import Selection
+from bake_core.shader_constants import bundle_constants, probe_texels
+from bake_core.shader_files import shader_dir
+from bake_core.spec import OutputName, Spec
+from bake_core.tally import State
+
+F32 = NDArray[np.float32]
+
+# Majercik et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production": the surface bias is
+# (n · 0.2 + wo · 0.8) · 0.75 · spacing · 0.3; 0.05 is the least a probe's visibility weighs, so that a cell is never left without light.
+PARAMETERS = {
+    "normal_bias": 0.2,
+    "view_bias": 0.8,
+    "bias_scale": 0.225,
+    "visibility_floor": 0.05,
+    "visibility_sharpness": float(VISIBILITY_SHARPNESS),
+}
+# Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
+# flat-wall variances come out negative). Distances are metres of any scale.
+_ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
+
+
+def generator() -> str:
+    """``octobake VERSION``."""
+    try:
+        return f"octobake {version('octobake')}"
+    except PackageNotFoundError:
+        return "octobake (not installed)"
+
+
+def assemble(
+    scene: Scene, spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State, stopped: Verdict, folder: Path
+) -> dict[str, Any]:
+    """Write atlases and shaders into a folder.
+
+    Returns
+    -------
+    dict
+        The manifest; a function of scene, spec and version only, except where a time limit ended the bake.
+
+    Raises
+    ------
+    BakeError
+        ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
+    """
+    active = state.active()
+    entries, data = [], []
+    first = 0
+    for volume in volumes:
+        probes = slice(first, first + volume.probe_count)
+        entry, content = _volume(volume, selection, state, active, probes, folder)
+        entries.append(entry)
+        data.append(content)
+        first += volume.probe_count
+    shaders = folder / "shaders"
+    shaders.mkdir()
+    for name in SHADERS:
+        shutil.copyfile(shader_dir() / name, shaders / name)
+    (shaders / "constants.glsl").write_text(bundle_constants(data))
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "generator": generator(),
+        "instruction_set": instruction_set(),
+        "scene": {"digest": scene.digest, "triangles": scene.triangle_count, "ignored": list(scene.ignored)},
+        "spec": spec.canonical(),
+        "samples": state.samples,
+        "stopped": stopped,
+        "error": {"value": state.error(), "target": spec.stop.target_error, "scrambles": SCRAMBLES},
+        "left_out": [{"what": what, "why": why} for what, why in selection.left_out],
+        "volumes": entries,
+        "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
+        "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
+    }
+
+
+def _volume(
+    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path
+) -> tuple[dict[str, Any], VolumeData]:
+    """One volume's files, its entry in the manifest, and what its shaders need to know."""
+    maps = {output: _interior(output, selection, state, probes) for output in selection.outputs}
+    tiles = [m.shape[1] + 2 for m in maps.values()]
+    shape = layout(volume.counts, max(tiles))
+    atlases, described = {}, []
+    for output, interior in maps.items():
+        if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
+            bad = int(np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0])
+            raise BakeError("bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}")
+        encoding, cost = ("float", 0.0) if output in _ALWAYS_FULL else choose_encoding(interior)
+        atlas = Atlas(output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding)
+        file = f"{volume.name}.{output}.exr"
+        _write_layers(folder / file, atlas.texels, output, half=encoding == "half")
+        entry: dict[str, Any] = {
+            "output": output,
+            "file": file,
+            "encoding": encoding,
+            "encoding_error": cost,
+            "channels": list(CHANNELS[output]),
+            "tile": atlas.tile,
+            "interior": atlas.interior,
+        }
+        if output == "distance":
+            entry["miss"] = selection.miss_distance
+        atlases[output] = atlas
+        described.append(entry)
+    content = VolumeData(
+        name=volume.name,
+        origin=volume.origin,
+        spacing=volume.spacing,
+        counts=np.asarray(volume.counts, np.int64),
+        states=active[probes].astype(np.uint8),
+        offsets=np.zeros((volume.probe_count, 3), np.float32),
+        backface=state.backface[probes],
+        parameters=PARAMETERS,
+        distance_limit=volume.distance_limit,
+        atlases=atlases,
+    )
+    table = probe_texels(content)
+    probe_file = f"{volume.name}.probes.exr"
+    _write_layers(folder / probe_file, table, "probes", half=False)
+    entry = {
+        "name": volume.name,
+        "origin": volume.origin.tolist(),
+        "spacing": volume.spacing.tolist(),
+        "counts": list(volume.counts),
+        "distance_limit": volume.distance_limit,
+        "parameters": PARAMETERS,
+        "layout": {"columns": shape.columns, "rows": shape.rows, "layers": shape.layers},
+        "probes": {
+            "file": probe_file,
+            "count": volume.probe_count,
+            "active": int(active[probes].sum()),
+            "states": active[probes].astype(int).tolist(),
+            "offsets": None,
+            # Shortest decimals of the float32 values.
+            "backface": [float(str(b)) for b in state.backface[probes]],
+        },
+        "atlases": described,
+    }
+    return entry, content
+
+
+def _interior(output: OutputName, selection: Selection, state: State, probes: slice) -> F32:
+    """One output's maps without borders, (p, side, side, channels) float32."""
+    if output == "visibility":
+        return state.visibility[probes]
+    if output == "distance":
+        return state.distance[probes].reshape(-1, selection.distance, selection.distance, 1)
+    if output == "normal":
+        return state.normal[probes].reshape(-1, selection.normal, selection.normal, 3)
+    # Never a silent inf: what does not fit float32 is caught where maps are checked.
+    with np.errstate(over="ignore"):
+        if output == "irradiance":
+            # The covariance term is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard error.
+            mean = np.maximum(state.irradiance[probes].sum(1) / state.samples, 0)
+            return mean.reshape(-1, selection.irradiance, selection.irradiance, 3).astype(np.float32)
+        return (state.radiance[probes] / state.samples).reshape(-1, selection.capture, selection.capture, 3).astype(np.float32)
+
+
+def _write_layers(path: Path, texels: F32, output: str, *, half: bool) -> None:
+    """Layers stacked downwards in one image, so that one read gives a 2D array's texels in order."""
+    layers, height, width, channels = texels.shape
+    write_exr(path, texels.reshape(layers * height, width, channels), CHANNELS[output], half=half)

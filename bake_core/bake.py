@@ -1,0 +1,273 @@
+"""The whole bake on one screen: scene and spec in, passes of samples over shards of probes, a bundle out.
+
+1. :func:`prepare`: place the probes, build what rays need.
+2. :func:`trace_shard`: one shard's part of one pass; any process may do it, in any order.
+3. :class:`bake_core.tally.State`: add a pass, measure the error; :func:`bake_core.convergence.decide` whether another follows.
+4. :func:`finish`: filter, pack, encode, write.
+
+:func:`bake` does it all here and now; the service does the same steps through its workers.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core import bundle, report
+from bake_core.assemble import assemble
+from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
+from bake_core.clock import Clock
+from bake_core.convergence import Point, Verdict, decide, fit_pass, next_pass
+from bake_core.filtering import visibility_moments
+from bake_core.gltf.reader import load_scene
+from bake_core.octahedral import texel_solid_angles
+from bake_core.placement import Volume, place
+from bake_core.progress import ProgressCallback
+from bake_core.scene import Scene
+from bake_core.selection import Selection, select
+from bake_core.spec import Spec
+from bake_core.tally import State, Tally
+from bake_core.transport import Tracer
+
+# Probes whose distances are held at once: 64² rays of 33 bytes each, some 35 MB.
+_DISTANCE_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A function of scene and spec only.
+
+    Attributes
+    ----------
+    positions : (n, 3) float64
+        Of all probes of all volumes in turn, local frame.
+    limits : (n,) float64
+        Each probe's distance limit, metres.
+    """
+
+    scene: Scene
+    spec: Spec
+    volumes: tuple[Volume, ...]
+    selection: Selection
+    tracer: Tracer
+    positions: NDArray[np.float64]
+    limits: NDArray[np.float64]
+
+    @property
+    def probe_count(self) -> int:
+        return len(self.positions)
+
+
+def prepare(scene: Scene, spec: Spec) -> Prepared:
+    """Place the probes, choose the outputs, build the acceleration structure.
+
+    Raises
+    ------
+    SpecError, SceneError
+    """
+    volumes = place(scene, spec)
+    return Prepared(
+        scene=scene,
+        spec=spec,
+        volumes=volumes,
+        selection=select(scene, spec),
+        tracer=Tracer.build(scene, spec),
+        positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
+        limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
+    )
+
+
+def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
+    """Half-open ranges of probes, as equal as they go; never an empty one."""
+    shards = max(1, min(shards, probe_count))
+    edges = [probe_count * i // shards for i in range(shards + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def empty_state(prepared: Prepared) -> State:
+    """The state before the first pass."""
+    n, s = prepared.probe_count, prepared.selection
+    return State(
+        samples=0,
+        irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3)),
+        radiance=np.zeros((n, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0)),
+        visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
+        backface=np.zeros(n, np.float32),
+        distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
+        normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
+    )
+
+
+def trace_shard(
+    prepared: Prepared,
+    probes: tuple[int, int],
+    samples: tuple[int, int],
+    *,
+    threads: int,
+    cancelled: NDArray[np.uint8] | None = None,
+    advance: Callable[[float], None] = lambda fraction: None,
+) -> Tally:
+    """One shard's part of one pass.
+
+    Parameters
+    ----------
+    probes, samples : (int, int)
+        Half-open ranges. The pass that starts at sample 0 also captures distances.
+    cancelled : (1,) uint8, optional
+        Set it to 1 from any thread: the kernels stop within one texel.
+    advance : callable
+        Told the fraction of this shard done since it was last called; from any thread.
+
+    Raises
+    ------
+    Cancelled
+    """
+    s = prepared.selection
+    flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
+    positions = np.ascontiguousarray(prepared.positions[slice(*probes)])
+    ids = np.arange(*probes, dtype=np.uint64)
+    capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
+    irradiance, radiance = capture_radiance(
+        prepared.tracer, positions, ids, samples, capture, threads=threads, cancelled=flag, advance=advance
+    )
+    empty = np.zeros
+    seen = _see(prepared, positions, prepared.limits[slice(*probes)], flag) if samples[0] == 0 else {}
+    return Tally(
+        *probes,
+        *samples,
+        irradiance,
+        radiance,
+        visibility=seen.get("visibility", empty((0, 0, 0, 0), np.float32)),
+        backface=seen.get("backface", empty(0, np.float32)),
+        distance=seen.get("distance", empty((0, 0), np.float32)),
+        normal=seen.get("normal", empty((0, 0, 0), np.float32)),
+    )
+
+
+def _see(prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], flag: NDArray[np.uint8]) -> dict[str, Any]:
+    """Distances and what is made of them, a few probes at a time."""
+    s = prepared.selection
+    parts: dict[str, list[NDArray[np.float32]]] = {"visibility": [], "backface": [], "distance": [], "normal": []}
+    solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
+    for first in range(0, len(positions), _DISTANCE_CHUNK):
+        chunk = slice(first, first + _DISTANCE_CHUNK)
+        distance, normal, back = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
+        # One row at a time: a matrix product's bits may depend on how many rows it has.
+        parts["backface"].append(np.array([solid_angle[row].sum() for row in back], np.float32))
+        if s.keeps("visibility"):
+            parts["visibility"].append(visibility_moments(distance, limits[chunk], s.visibility))
+        if s.keeps("distance"):
+            parts["distance"].append(np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32))
+        if s.keeps("normal"):
+            if s.normal != s.distance:
+                _, normal, _ = capture_distance(prepared.tracer, positions[chunk], s.normal, cancelled=flag)
+            parts["normal"].append(normal)
+    return {name: np.concatenate(rows) for name, rows in parts.items() if rows}
+
+
+@dataclass
+class Run:
+    """What happened in time: goes into the report, never into the manifest."""
+
+    threads: int
+    shards: int
+    curve: list[Point] = field(default_factory=list)
+    stopped: Verdict = "continue"
+    seconds: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+
+
+def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, Any]:
+    """Write the bundle: atlases, shaders, manifest, report; all or nothing.
+
+    Returns
+    -------
+    dict
+        The manifest.
+    """
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
+        work = Path(folder) / "bundle"
+        work.mkdir()
+        manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
+        written = bundle.dump_json(manifest)
+        (work / bundle.MANIFEST).write_bytes(written)
+        report.write(work, manifest, bundle.content_digest(written), asdict(run))
+        shutil.move(work, Path(folder).with_name(Path(folder).name + "-bundle"))
+        bundle.publish(Path(folder).with_name(Path(folder).name + "-bundle"), out)
+    return manifest
+
+
+@dataclass(frozen=True)
+class BakeResult:
+    """`met` tells whether the target error was reached, or none was asked for."""
+
+    manifest: dict[str, Any]
+    run: Run
+    met: bool
+
+
+def bake(
+    scene_path: str | Path,
+    spec: Spec,
+    out: str | Path,
+    *,
+    threads: int = 1,
+    shards: int = 1,
+    progress: ProgressCallback | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> BakeResult:
+    """Bake here and now.
+
+    Parameters
+    ----------
+    scene_path : path
+        .glb or .gltf.
+    out : path
+        A folder, or a zip where it ends in .zip; an existing one is replaced only if it is a bundle.
+    threads, shards : int
+        How the work is split; the bundle does not depend on it.
+
+    Raises
+    ------
+    InputError
+        Nothing was written.
+    Cancelled
+    """
+    out = Path(out).absolute()
+    bundle.check_replaceable(out)
+    clock = Clock(spec, progress)
+    clock.stage("reading")
+    scene = load_scene(scene_path)
+    clock.stage("building")
+    prepared = prepare(scene, spec)
+    clock.stage("tracing")
+    state, run = empty_state(prepared), Run(threads, shards)
+    ranges = shard_ranges(prepared.probe_count, shards)
+    while run.stopped == "continue":
+        samples = fit_pass(spec.stop, next_pass(spec.stop, state.samples), run.curve, clock.elapsed)
+        if samples[0] == samples[1]:
+            run.stopped = "time"
+            break
+        clock.begin(samples, len(ranges))
+        state.add([trace_shard(prepared, r, samples, threads=threads, cancelled=cancelled, advance=clock.advance) for r in ranges])
+        error, seconds = state.error(), clock.elapsed
+        run.curve.append(Point(state.samples, seconds, error))
+        clock.measured(state.samples, error)
+        run.stopped = decide(spec.stop, state.samples, error, seconds)
+    clock.stage("writing")
+    run.seconds, run.stages = clock.elapsed, clock.stages()
+    manifest = finish(prepared, state, run, out)
+    return BakeResult(manifest, run, met(spec, run.curve))
+
+
+def met(spec: Spec, curve: Sequence[Point]) -> bool:
+    """Whether a bake got what it was asked for: its target error, where there was one."""
+    target, error = spec.stop.target_error, curve[-1].error
+    return target is None or (error is not None and error <= target)

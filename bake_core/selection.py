@@ -1,0 +1,71 @@
+"""What a bake keeps and what it leaves out, with the reasons."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bake_core.scene import Scene
+from bake_core.spec import OUTPUTS, OutputName, Spec
+
+# The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
+_CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Outputs and resolutions of one bake.
+
+    Attributes
+    ----------
+    outputs : tuple of str
+        What the bundle holds, in DESIGN's order.
+    left_out : tuple of (what, why)
+    capture : int
+        Texels along the radiance (capture) map's side, stored or not.
+    irradiance, visibility, distance, normal : int
+        Texels along each map's side.
+    miss_distance : float
+        What the distance map holds where a ray meets nothing: finite, and longer than any hit can be.
+    """
+
+    outputs: tuple[OutputName, ...]
+    left_out: tuple[tuple[str, str], ...]
+    capture: int
+    irradiance: int
+    visibility: int
+    distance: int
+    normal: int
+    miss_distance: float
+
+    def keeps(self, output: OutputName) -> bool:
+        return output in self.outputs
+
+
+def select(scene: Scene, spec: Spec) -> Selection:
+    """Choose outputs: what the spec demands, or what the scene's materials can make use of."""
+    used = np.unique(scene.triangle_material)
+    m = scene.materials
+    glossy = bool(((m.metallic[used] != 0) | (m.roughness[used] != 1)).any())
+    if spec.outputs == "auto":
+        kept: tuple[OutputName, ...] = OUTPUTS if glossy else ("irradiance", "visibility")
+        why = "no material is glossy, so nothing reflects single directions"
+    else:
+        kept = tuple(o for o in OUTPUTS if o in spec.outputs)
+        why = "not in the spec's outputs"
+    size = scene.bounds[1] - scene.bounds[0]
+    # A power of two above four diagonals, so that the value says of itself that it is no measurement.
+    miss = 2.0 ** math.ceil(math.log2(4 * max(float(np.linalg.norm(size)), 1e-6)))
+    r = spec.resolution
+    return Selection(
+        outputs=kept,
+        left_out=tuple((o, why) for o in OUTPUTS if o not in kept),
+        capture=r.radiance or (_CAPTURE_GLOSSY if glossy else _CAPTURE_DIFFUSE),
+        irradiance=r.irradiance,
+        visibility=r.visibility,
+        distance=r.distance,
+        normal=r.normal,
+        miss_distance=miss,
+    )
