@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
-
-from bake_core.kernel_cache import kernel_cache_dir
-
-# Before any test module declares a kernel, and for every process that a test starts.
-os.environ["NUMBA_CACHE_DIR"] = str(kernel_cache_dir())
 
 
 @pytest.fixture(scope="session")
