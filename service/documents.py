@@ -1,0 +1,228 @@
+"""The JSON that goes over HTTP, both ways: what the OpenAPI document and every client's types are made from."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
+
+from service.jobs import Job, State
+
+Digest = Annotated[
+    str,
+    Field(pattern=r"^sha256:[0-9a-f]{64}$", examples=["sha256:2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae"]),
+]
+LABEL_KEY = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
+Labels = Annotated[
+    dict[Annotated[str, Field(pattern=LABEL_KEY)], Annotated[str, Field(max_length=256)]],
+    Field(max_length=32, description="For your own use; lists can be filtered by them.", examples=[{"level": "rooms"}]),
+]
+Priority = Annotated[int, Field(ge=-1000, le=1000, description="Higher goes first; equals go in order of arrival.")]
+# The spec has its own parser, whose errors name its fields; the framework only needs to know that it is an object.
+# Its place in the OpenAPI document is taken by the spec's own schema: see service.app.
+SPEC_MARK = "x-octobake-spec"
+SpecDocument = Annotated[dict[str, Any], WithJsonSchema({"type": "object", SPEC_MARK: True})]
+Time = Annotated[datetime, Field(description="UTC.")]
+
+
+class _Request(BaseModel):
+    # Strict: "1" is no number. A key that nobody reads is a mistake of the sender's.
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Problem(BaseModel):
+    """RFC 9457. Branch on `slug`; show `detail`."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "urn:octobake:problem:spec.unknown_key",
+                    "title": "Unprocessable Entity",
+                    "status": 422,
+                    "detail": "is not a key of a spec",
+                    "slug": "spec.unknown_key",
+                    "where": "spec: volumes[0].spacin",
+                }
+            ]
+        }
+    )
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    slug: str = Field(description="Stable name of the error, `area.reason`.")
+    where: str = Field(description="The file, node, field or probe at fault; may be empty.")
+
+
+class SceneRequest(_Request):
+    """A scene of several files, each uploaded as a blob before."""
+
+    root: str = Field(description="Name of the .gltf or .glb among `files`.", examples=["room.gltf"])
+    files: dict[str, Digest] = Field(description="Name, as URIs in the scene say it, to digest.", min_length=1, max_length=10_000)
+
+
+class Scene(BaseModel):
+    """A scene that the reader accepted, and what is in it."""
+
+    digest: Digest
+    triangles: int = Field(description="As rays see them: every instance's counted.")
+    instances: int
+    materials: list[str]
+    lights: int
+    cameras: list[str]
+    nodes: int
+    bounds: list[list[float]] = Field(description="World-space box of all triangles, [min, max].")
+    ignored: list[str] = Field(description="What was read over, one line each.")
+
+
+class BakeRequest(_Request):
+    """A bake to be queued."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "scene": "sha256:2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae",
+                    "spec": {"version": 1, "volumes": [{"fit": "scene", "counts": [4, 3, 4]}], "stop": {"target_error": 0.02}},
+                    "labels": {"level": "rooms"},
+                    "priority": 0,
+                }
+            ]
+        }
+    )
+
+    scene: Digest
+    spec: SpecDocument
+    labels: Labels = {}
+    priority: Priority = 0
+
+
+class Progress(BaseModel):
+    """How far a job has come."""
+
+    stage: str = Field(description="reading, compiling, building, tracing, writing; a verification has its own.")
+    fraction: float = Field(ge=0, le=1, description="Of the whole job; never falls.")
+    samples: int = Field(description="Per capture texel, so far.")
+    error: float | None = Field(description="So far: relative RMS, 95 % upper bound.")
+    seconds: float
+    eta: float | None = Field(description="Seconds to go; null while unknown.")
+
+
+class Point(BaseModel):
+    """A point on a bake's curve of error against time."""
+
+    samples: int
+    error: float | None
+    seconds: float
+
+
+class JobError(BaseModel):
+    """Why a job failed."""
+
+    slug: str
+    where: str
+    message: str
+    exit_code: int = Field(description="What `octobake bake` would have exited with.")
+
+
+class BakeResult(BaseModel):
+    """What came of a bake."""
+
+    bundle: Digest
+    report: Digest
+    samples: int
+    error: float | None
+    seconds: float
+    stopped: str = Field(description="target, samples or time.")
+    exit_code: int = Field(description="0; or 4: out of budget before the target error.")
+
+
+class _Job(BaseModel):
+    id: str
+    state: State
+    labels: dict[str, str]
+    priority: int
+    attempts: int = Field(description="Times that a worker was lost under this job.")
+    created: Time
+    started: Time | None
+    finished: Time | None
+    progress: Progress | None
+    error: JobError | None
+    links: dict[str, str] = Field(description="Paths of what belongs to this job and is there now.")
+
+
+class Bake(_Job):
+    """A bake."""
+
+    scene: Digest
+    spec: SpecDocument = Field(description="With every default filled in.")
+    curve: list[Point]
+    result: BakeResult | None
+
+
+class VerificationRequest(_Request):
+    """A verification of a finished bake: rendered with its bundle, compared with a path-traced twin."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"bake": "9f86d081884c7d65", "width": 320, "height": 240}]})
+
+    bake: str = Field(description="Id of a bake that has succeeded.")
+    labels: Labels = {}
+    priority: Priority = 0
+
+
+class StoredFile(BaseModel):
+    """A file that a job made."""
+
+    digest: Digest
+    bytes: int
+
+
+class VerificationResult(BaseModel):
+    """What came of a verification."""
+
+    passed: bool
+    report: dict[str, Any] = Field(description="The figures; the same as report.json among the files.")
+    files: dict[str, StoredFile]
+    exit_code: int = Field(description="0; or 5: a threshold failed.")
+
+
+class Verification(_Job):
+    """A verification."""
+
+    bake: str
+    result: VerificationResult | None
+
+
+Item = TypeVar("Item")
+
+
+class Page(BaseModel, Generic[Item]):
+    """A page of a list, the newest first."""
+
+    items: list[Item]
+    next: str | None = Field(description="`cursor` of the next page; null on the last.")
+
+
+def common(job: Job, progress: dict[str, Any] | None, path: str, *more: str) -> dict[str, Any]:
+    """What a bake's and a verification's documents share; `more` names resources below the job's own path."""
+    path = f"{path}/{job.id}"
+    return {
+        "id": job.id,
+        "state": job.state,
+        "labels": job.labels,
+        "priority": job.priority,
+        "attempts": job.attempts,
+        "created": _time(job.created),
+        "started": _time(job.started),
+        "finished": _time(job.finished),
+        "progress": progress or job.progress,
+        "error": job.error,
+        "links": {"self": path, "events": f"{path}/events", **{name: f"{path}/{name}" for name in more}},
+    }
+
+
+def _time(seconds: float | None) -> datetime | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

@@ -1,0 +1,44 @@
+"""The parts of the service, put together."""
+
+from __future__ import annotations
+
+import fcntl
+
+from bake_core.errors import MachineError
+from service.blobs import Blobs
+from service.hub import Hub
+from service.scenes import Outlines
+from service.scheduler import Scheduler
+from service.settings import Settings
+from service.store import Store
+
+
+class Service:
+    """Everything behind the routes. One process owns a data folder at a time."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        folder = settings.data_folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = open(folder / "lock", "w")  # noqa: SIM115  held until close()
+        except OSError as e:
+            raise MachineError("service.data_unusable", f"the data folder cannot be used: {e.strerror}", str(folder)) from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.close()
+            text = "another octobake serves from this data folder; stop it, or give --data"
+            raise MachineError("service.data_in_use", text, str(folder)) from None
+        self.blobs = Blobs(settings.store_url, folder / "scratch")
+        self.blobs.clean()
+        self.store = Store(settings.database_url)
+        self.outlines = Outlines(self.blobs)
+        self.hub = Hub()
+        self.scheduler = Scheduler(settings, self.store, self.blobs, self.hub)
+
+    def close(self) -> None:
+        """Stop the work, leave it to be resumed, and let go of the data folder."""
+        self.scheduler.close()
+        self.store.close()
+        self._lock.close()

@@ -1,0 +1,42 @@
+"""What all routes say the same way."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+
+from service.parts import Service
+from service.problems import MEDIA_TYPE, RequestError
+
+_TEXTS = {
+    400: "What was sent cannot be read.",
+    404: "There is no such thing.",
+    409: "It is not there yet, or never will be; `slug` says which.",
+    412: "A condition of the request does not hold.",
+    413: "The body is too large.",
+    415: "The body's media type is not one that is taken here.",
+    416: "The range lies outside the file.",
+    422: "What was sent is wrong; `slug`, `where` and `detail` say what.",
+    503: "The service lacks something at the moment.",
+}
+
+
+def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The problems that a route answers with, for the OpenAPI document."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"description": _TEXTS[status], "content": content} for status in statuses}
+
+
+def the_service(request: Request) -> Service:
+    """The service that this application speaks for."""
+    service: Service = request.app.state.service
+    return service
+
+
+Here = Annotated[Service, Depends(the_service)]
+
+
+def unknown(what: str, name: str) -> RequestError:
+    """404: `what` (scene, bake, …) called `name` does not exist."""
+    return RequestError(f"{what}.unknown", f"there is no {what} {name}", what, 404)

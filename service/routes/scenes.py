@@ -1,0 +1,102 @@
+"""Scenes: what the reader accepts, by digest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import ValidationError
+
+from bake_core.gltf.reader import load_scene_files
+from bake_core.scene import Scene as SceneArrays
+from service import documents
+from service.parts import Service
+from service.problems import RequestError
+from service.routes.bodies import media_type, read_json, receive
+from service.routes.common import Here, failures, unknown
+
+GLB_TYPES = ("model/gltf-binary", "application/octet-stream", "")
+# What a GLB that is sent as a body is called; its digest does not depend on it.
+GLB_NAME = "scene.glb"
+
+router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+
+@router.post(
+    "",
+    operation_id="createScene",
+    summary="Add a scene",
+    status_code=201,
+    response_model=documents.Scene,
+    responses={200: {"model": documents.Scene, "description": "It was here already."}, **failures(400, 413, 415, 422)},
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "model/gltf-binary": {"schema": {"type": "string", "format": "binary"}},
+                "application/json": {"schema": documents.SceneRequest.model_json_schema()},
+            },
+        }
+    },
+)
+async def create_scene(request: Request, service: Here) -> Response:
+    """Read a scene strictly, and keep it: a GLB as the body, or JSON that names blobs uploaded before."""
+    kind = media_type(request)
+    if kind == "application/json":
+        body = await read_json(request, service.settings.max_json_bytes)
+        return await run_in_threadpool(_from_blobs, service, body)
+    if kind not in GLB_TYPES:
+        text = "send a GLB as model/gltf-binary, or names of blobs as application/json"
+        raise RequestError("request.unsupported_media_type", text, "Content-Type", 415)
+    with service.blobs.upload() as upload:
+        await receive(request, upload, service.settings.max_upload_bytes)
+        scene = await run_in_threadpool(load_scene_files, GLB_NAME, {GLB_NAME: upload.path})
+        await run_in_threadpool(upload.keep)
+        await run_in_threadpool(service.store.add_blob, upload.digest, upload.size)
+        return await run_in_threadpool(_add, service, GLB_NAME, {GLB_NAME: upload.digest}, scene)
+
+
+@router.get("/{digest}", operation_id="getScene", summary="What is in a scene", responses=failures(404))
+def get_scene(digest: str, service: Here) -> documents.Scene:
+    """Answer what the reader found in a scene that was added before."""
+    scene = service.store.scene(digest)
+    if scene is None:
+        raise unknown("scene", digest)
+    return documents.Scene(digest=digest, **scene["contents"])
+
+
+def _from_blobs(service: Service, body: Any) -> Response:
+    try:
+        asked = documents.SceneRequest.model_validate(body)
+    except ValidationError as e:
+        raise RequestValidationError([{**d, "loc": ("body", *d["loc"])} for d in e.errors()]) from None
+    paths: dict[str, Path] = {}
+    for name, digest in asked.files.items():
+        if service.store.blob_size(digest) is None:
+            raise RequestError("blob.unknown", f"{digest} has not been uploaded", f"body.files.{name}", 422)
+        paths[name] = service.blobs.local_path(digest)
+    return _add(service, asked.root, asked.files, load_scene_files(asked.root, paths))
+
+
+def _add(service: Service, root: str, files: Mapping[str, str], scene: SceneArrays) -> Response:
+    known = service.store.scene(scene.digest) is not None
+    contents = {
+        "triangles": scene.triangle_count,
+        "instances": len(scene.instance_mesh),
+        "materials": list(scene.materials.name),
+        "lights": len(scene.lights.kind),
+        "cameras": [camera.name for camera in scene.cameras],
+        "nodes": len(scene.nodes),
+        "bounds": scene.bounds.tolist(),
+        "ignored": list(scene.ignored),
+    }
+    service.outlines.add(scene)
+    service.store.add_scene(scene.digest, root, files, contents)
+    document = documents.Scene(digest=scene.digest, **contents)
+    headers = {"Location": f"/v1/scenes/{scene.digest}"}
+    return JSONResponse(document.model_dump(mode="json"), 200 if known else 201, headers)

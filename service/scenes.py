@@ -1,0 +1,49 @@
+"""Stored scenes, read again: whole for a worker, in outline for whoever only asks where probes would stand."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from bake_core.gltf.reader import load_scene_files
+from bake_core.scene import Scene
+from service.blobs import Blobs
+
+# Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
+KEPT_OUTLINES = 64
+
+
+def load_stored(blobs: Blobs, scene: Mapping[str, Any]) -> Scene:
+    """Read a scene from its row's ``root`` and ``files``; the reader checks it again, for a worker takes nobody's word."""
+    return load_scene_files(scene["root"], {name: blobs.local_path(digest) for name, digest in scene["files"].items()})
+
+
+class Outlines:
+    """The last scenes asked for, without their geometry."""
+
+    def __init__(self, blobs: Blobs) -> None:
+        self._blobs = blobs
+        self._kept: OrderedDict[str, Scene] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, digest: str, scene: Mapping[str, Any]) -> Scene:
+        """The outline of the scene whose row is `scene`; reads it the first time."""
+        with self._lock:
+            if digest in self._kept:
+                self._kept.move_to_end(digest)
+                return self._kept[digest]
+        return self.add(load_stored(self._blobs, scene))
+
+    def add(self, scene: Scene) -> Scene:
+        """Keep and answer the outline of a scene that is at hand."""
+        # Copies, for a slice would keep the whole array alive.
+        arrays = ("positions", "normals", "colors", "indices", "triangle_material")
+        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays})
+        with self._lock:
+            self._kept[scene.digest] = outline
+            while len(self._kept) > KEPT_OUTLINES:
+                self._kept.popitem(last=False)
+        return outline

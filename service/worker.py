@@ -1,0 +1,203 @@
+"""What runs inside a Dask worker: each function takes and returns names of stored bytes, never the bytes.
+
+A task is told everything it needs in a :class:`Work`, fetches the scene by digest, keeps the last few prepared scenes, and polls a flag
+that Dask's cancel raises. Loaded by every worker at its start (`dask_setup`), so that the first task does not wait for imports.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import threading
+import time
+import zipfile
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dask.typing import Key
+from distributed import Worker, WorkerPlugin, get_worker
+from numpy.typing import NDArray
+
+from bake_core import bake
+from bake_core.spec import parse_spec
+from bake_core.tally import State, Tally
+from service.blobs import Blobs
+from service.scenes import load_stored
+
+TOPIC = "octobake"
+# Oftener than this nobody can read; the terminal redraws at 10 Hz, a web page at less.
+REPORT_INTERVAL = 0.2
+Flag = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Work:
+    """What every task of a bake is told.
+
+    Attributes
+    ----------
+    job : str
+    store : str
+        URL of the blob store.
+    scene : dict
+        ``root`` and ``files`` (name to digest).
+    spec : dict
+        Canonical.
+    threads : int
+    cached_scenes : int
+    """
+
+    job: str
+    store: str
+    scene: Mapping[str, Any]
+    spec: Mapping[str, Any]
+    threads: int
+    cached_scenes: int
+
+    @property
+    def own_threads(self) -> int:
+        """`threads`, or where it is 0 every CPU that the process which asks may use."""
+        return self.threads or len(os.sched_getaffinity(0))
+
+
+def prepare(work: Work) -> tuple[int, int]:
+    """Read, check and build the scene; answers how many probes there are, and how many threads this worker bakes with."""
+    with _task():
+        return _prepared(work).probe_count, work.own_threads
+
+
+def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int]) -> tuple[str, float]:
+    """One shard of one pass; answers where its sums are stored and the seconds it took."""
+    with _task() as task:
+        prepared = _prepared(work)
+        began = time.monotonic()
+        tally = bake.trace_shard(prepared, probes, samples, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
+        seconds = time.monotonic() - began
+        return _blobs(work.store).put_work(work.job, name, tally.to_bytes()), seconds
+
+
+def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> tuple[str, float | None]:
+    """Add a whole pass to the sums before it; answers where the new ones are stored, and their error."""
+    with _task():
+        blobs = _blobs(work.store)
+        sums = _state(work, state)
+        sums.add([Tally.from_bytes(blobs.get_work(work.job, tally)) for tally in tallies])
+        return blobs.put_work(work.job, name, sums.to_bytes()), sums.error()
+
+
+def finish(work: Work, state: str, run: bake.Run) -> dict[str, Any]:
+    """Filter, encode and pack; answers the digests and sizes of the bundle and of its report."""
+    with _task(), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+        blobs = _blobs(work.store)
+        out = Path(folder) / "bundle.zip"
+        bake.finish(_prepared(work), _state(work, state), run, out)
+        with zipfile.ZipFile(out) as bundle:
+            report = Path(bundle.extract("report.json", folder))
+        return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report)}
+
+
+class CancelFlags(WorkerPlugin):
+    """One flag per running task, raised as soon as Dask wants the task stopped.
+
+    ``Client.cancel`` does not stop a thread; it does change the task's state, and that this hook sees within milliseconds.
+    """
+
+    name = "octobake-cancel-flags"
+
+    def __init__(self) -> None:
+        self.flags: dict[Key, Flag] = {}
+
+    def transition(self, key: Key, start: str, finish: str, **_: Any) -> None:
+        """Make a flag for a task that begins, raise it when the task is no longer wanted, or is over."""
+        if finish == "executing":
+            self.flags.setdefault(key, np.zeros(1, np.uint8))
+        elif start == "executing":
+            self.flags.pop(key)[0] = 1
+
+
+class _Task:
+    """This process's end of a running task: its cancel flag, and its voice."""
+
+    def __init__(self) -> None:
+        self._worker: Worker = get_worker()
+        self._key = self._worker.get_current_task()
+        self._done = 0.0
+        self._told_at = float("-inf")
+        self._lock = threading.Lock()
+        flags = self._worker.plugins[CancelFlags.name]
+        assert isinstance(flags, CancelFlags)
+        # No flag: the task was cancelled between its start and this line.
+        self.flag = flags.flags.get(self._key, np.ones(1, np.uint8))
+
+    def advance(self, fraction: float) -> None:
+        """Another part of this task is done; told now and then. Called from the kernels' threads."""
+        with self._lock:
+            self._done += fraction
+            now = time.monotonic()
+            if now - self._told_at < REPORT_INTERVAL:
+                return
+            self._told_at, done = now, self._done
+        self.tell(done=done)
+
+    def tell(self, **message: Any) -> None:
+        """Send a message to the service."""
+        self._worker.log_event(TOPIC, {"key": self._key, "address": self._worker.address, **message})
+
+
+@contextmanager
+def _task() -> Iterator[_Task]:
+    task = _Task()
+    task.tell(began=True)
+    try:
+        yield task
+    finally:
+        task.tell(ended=True)
+
+
+# A worker has one task slot, so one thread at a time works on these; the lock is for whoever runs a worker with more.
+_cache: OrderedDict[str, bake.Prepared] = OrderedDict()
+_stores: dict[str, Blobs] = {}
+_lock = threading.Lock()
+
+
+def _blobs(url: str) -> Blobs:
+    with _lock:
+        if url not in _stores:
+            _stores[url] = Blobs(url, Path(tempfile.gettempdir()) / "octobake-blobs")
+        return _stores[url]
+
+
+def _prepared(work: Work) -> bake.Prepared:
+    key = repr((work.scene, work.spec))
+    stored = _blobs(work.store)
+    with _lock:
+        if key not in _cache:
+            scene = load_stored(stored, work.scene)
+            # Room first: the old scene's memory is free before the new one's is taken.
+            while len(_cache) >= work.cached_scenes:
+                _cache.popitem(last=False)
+            _cache[key] = bake.prepare(scene, parse_spec(work.spec))
+        _cache.move_to_end(key)
+        return _cache[key]
+
+
+def _state(work: Work, reference: str | None) -> State:
+    if reference is None:
+        return bake.empty_state(_prepared(work))
+    return State.from_bytes(_blobs(work.store).get_work(work.job, reference))
+
+
+def dask_setup(_: Worker) -> None:
+    """Called by Dask when a worker starts.
+
+    Ctrl-C in the service's terminal, and a service manager's SIGTERM to the whole group, are the service's to act on: a worker that went
+    by itself would be taken for lost. It ends with the service, however that ends.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
