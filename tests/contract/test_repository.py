@@ -81,9 +81,7 @@ def test_every_direct_dependency_is_locked() -> None:
     assert names(project()["build-system"]["requires"]) | names(project("clients/python")["build-system"]["requires"]) <= locked[1]
 
 
-@pytest.mark.parametrize(
-    ("folder", "packages"), [(".", ("bake_core", "service")), ("clients/python", ("clients/python/octobake_client",))]
-)
+@pytest.mark.parametrize(("folder", "packages"), [(".", ("bake_core", "service")), ("clients/python", ("clients/python/octobake_client",))])
 def test_every_import_is_declared(folder: str, packages: tuple[str, ...]) -> None:
     """What a package imports it declares, and does not borrow from what some dependency happens to bring."""
     declared = {normal(NAME.match(r).group()) for r in project(folder)["project"]["dependencies"]}  # type: ignore[union-attr]
@@ -117,7 +115,8 @@ def test_no_paths_of_one_machine_and_no_hosts_of_package_indexes() -> None:
 
 
 def test_the_wheel_carries_shaders_pages_and_licence(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)], cwd=ROOT, check=True, capture_output=True)
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("octobake-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
