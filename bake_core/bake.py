@@ -151,12 +151,17 @@ def trace_shard(
     )
 
 
+def compile_kernels(prepared: Prepared) -> None:
+    """Compile, or fetch from the cache on disk, every kernel that a bake runs: by tracing no probe at all."""
+    trace_shard(prepared, (0, 0), (0, 0), threads=1)
+
+
 def _see(prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], flag: NDArray[np.uint8]) -> dict[str, Any]:
     """Distances and what is made of them, a few probes at a time."""
     s = prepared.selection
     parts: dict[str, list[NDArray[np.float32]]] = {"visibility": [], "backface": [], "distance": [], "normal": []}
     solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
-    for first in range(0, len(positions), _DISTANCE_CHUNK):
+    for first in range(0, max(len(positions), 1), _DISTANCE_CHUNK):
         chunk = slice(first, first + _DISTANCE_CHUNK)
         distance, normal, back = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
         # One row at a time: a matrix product's bits may depend on how many rows it has.
@@ -247,6 +252,8 @@ def bake(
     scene = load_scene(scene_path)
     clock.stage("building")
     prepared = prepare(scene, spec)
+    clock.stage("compiling")
+    compile_kernels(prepared)
     clock.stage("tracing")
     state, run = empty_state(prepared), Run(threads, shards)
     ranges = shard_ranges(prepared.probe_count, shards)

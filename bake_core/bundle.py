@@ -253,6 +253,21 @@ def read_bundle(path: str | Path) -> Bundle:
         return _read_folder(Path(folder), path)
 
 
+def read_report(path: str | Path) -> dict[str, Any] | None:
+    """A bundle's ``report.json``; None where somebody has left it out."""
+    path = Path(path)
+    try:
+        if path.is_dir():
+            text = (path / "report.json").read_bytes()
+        else:
+            with _open_zip(path) as archive:
+                text = archive.read("report.json")
+    except (OSError, KeyError):
+        return None
+    report: dict[str, Any] = strict_json.parse(text, BundleError, "bundle", f"{path}: report.json")
+    return report
+
+
 def _inside(folder: Path, name: str, path: Path) -> Path:
     if not isinstance(name, str) or name.startswith("/") or ".." in Path(name).parts:
         raise BundleError("bundle.damaged", f"names a file outside itself: {name!r}", str(path))

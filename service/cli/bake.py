@@ -1,0 +1,76 @@
+"""``octobake bake``: bakes here, with no server."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+
+def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("bake", help="bake a scene here, with no server")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb or .gltf")
+    parser.add_argument("--spec", metavar="SPEC", type=Path, required=True, help="JSON file: volumes, lights, environment, when to stop")
+    parser.add_argument("-o", "--out", metavar="OUT", type=Path, required=True, help="a folder, or a zip where it ends in .zip")
+    parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
+    parser.add_argument("--shards", type=positive, default=1, help="split each pass into this many parts; the bundle is the same")
+    parser.add_argument("--json", action="store_true", help="print one JSON document: bundle, digest, error, seconds, curve")
+    parser.set_defaults(run=run)
+
+
+def positive(text: str) -> int:
+    """An argparse type: a whole number from 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Bake; 4 where the target error was not reached."""
+    import numpy as np
+
+    from bake_core import bundle
+    from bake_core.bake import bake
+    from bake_core.report import percent
+    from bake_core.spec import load_spec
+    from service.cli.progress import ProgressLine
+
+    spec = load_spec(args.spec)
+    cancelled = np.zeros(1, np.uint8)
+    # Kernels run without the GIL and only look at this flag: Ctrl-C ends a bake within a texel.
+    previous = signal.signal(signal.SIGINT, lambda *_: cancelled.fill(1))
+    line = ProgressLine(sys.stderr)
+    try:
+        result = bake(args.scene, spec, args.out, threads=args.threads, shards=args.shards, progress=line, cancelled=cancelled)
+    finally:
+        line.close()
+        signal.signal(signal.SIGINT, previous)
+    manifest, done = result.manifest, result.run
+    error, probes = manifest["error"]["value"], sum(v["probes"]["count"] for v in manifest["volumes"])
+    if args.json:
+        document = {
+            "bundle": str(args.out),
+            "content_digest": bundle.content_digest(bundle.dump_json(manifest)),
+            "probes": probes,
+            "samples": manifest["samples"],
+            "error": error,
+            "target_error": spec.stop.target_error,
+            "stopped": manifest["stopped"],
+            "seconds": done.seconds,
+            "curve": [{"samples": p.samples, "seconds": p.seconds, "error": p.error} for p in done.curve],
+        }
+        print(json.dumps(document, indent=2))
+    else:
+        print(f"{args.out}: {probes} probes, {manifest['samples']} samples, error {percent(error)}, {done.seconds:.1f} s")
+    if not result.met:
+        print(
+            f"octobake: stopped by {manifest['stopped']} at error {percent(error)}, above the target of {percent(spec.stop.target_error)}; "
+            "raise stop.max_samples or stop.max_seconds",
+            file=sys.stderr,
+        )
+        return 4
+    return 0

@@ -1,0 +1,58 @@
+"""``octobake info``: what is in a bundle, what was left out and why, error against time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("info", help="what is in a bundle, what was left out and why, error against time")
+    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="a folder or a zip")
+    parser.add_argument("--json", action="store_true", help="print manifest, report and content digest as one JSON document")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print it."""
+    from bake_core.bundle import content_digest, dump_json, read_bundle, read_report
+
+    manifest, report = read_bundle(args.bundle).manifest, read_report(args.bundle)
+    digest = content_digest(dump_json(manifest))
+    if args.json:
+        print(json.dumps({"content_digest": digest, "manifest": manifest, "report": report}, indent=2))
+    else:
+        print("\n".join(_lines(manifest, report, digest)))
+    return 0
+
+
+def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
+    from bake_core.report import percent
+
+    error = manifest["error"]
+    size = sum(f["bytes"] for f in manifest["files"].values())
+    lines = [
+        f"bundle     {digest}",
+        f"made by    {manifest['generator']} on {manifest['instruction_set']}",
+        f"scene      {manifest['scene']['digest']}, {manifest['scene']['triangles']} triangles",
+        f"samples    {manifest['samples']}, stopped by {manifest['stopped']}",
+        f"error      {percent(error['value'])} (target {percent(error['target'])}), sampling only",
+        f"size       {size} bytes",
+    ]
+    for v in manifest["volumes"]:
+        probes = v["probes"]
+        lines.append(
+            f"volume     {v['name']}: {'×'.join(map(str, v['counts']))} probes, {probes['active']} active, {probes['count'] - probes['active']} inside geometry"
+        )
+        lines += [
+            f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {percent(a['encoding_error'])}: {a['file']}"
+            for a in v["atlases"]
+        ]
+    lines += [f"left out   {x['what']}: {x['why']}" for x in manifest["left_out"]]
+    lines += [f"ignored    {line}" for line in manifest["scene"]["ignored"]]
+    if report is not None:
+        lines += ["", f"{'samples':>9}{'seconds':>10}{'error':>10}"]
+        lines += [f"{p['samples']:>9}{p['seconds']:>10.2f}{percent(p['error']):>10}" for p in report["curve"]]
+    return lines
