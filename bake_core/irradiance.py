@@ -1,7 +1,7 @@
 """The irradiance query in numpy: what ``shaders/irradiance.glsl`` computes, for thousands of points at once.
 
 Every function mirrors the GLSL function of the same name; see there for the papers. Texels are the bundle's float32; everything
-else is float64, so differences from GLSL are GLSL's rounding (tests hold them to 2e-5 of a volume's brightest texel).
+else is float64, so differences from GLSL are GLSL's rounding (tests hold them to 5e-6 of a volume's brightest texel).
 """
 
 from __future__ import annotations

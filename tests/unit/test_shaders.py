@@ -74,7 +74,7 @@ def test_the_irradiance_query_agrees_with_its_numpy_twin() -> None:
     difference = np.abs(found[:, :3] - expected.irradiance).max(-1)
     brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
     assert np.isfinite(found).all()
-    assert difference.max() < 2e-5 * brightest, f"worst at {points[0][difference.argmax()]}"
+    assert difference.max() < 5e-6 * brightest, f"worst at {points[0][difference.argmax()]}"
 
 
 def test_the_irradiance_query_agrees_with_the_fixtures() -> None:

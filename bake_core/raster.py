@@ -1,0 +1,280 @@
+"""The verification's picture: the scene rasterised with Vulkan, lit by shadow maps and by the reference GLSL module.
+
+What a renderer that uses a bundle would do, only with more samples a pixel: a picture is the mean of many, each moved by a fraction of
+a pixel, so that it is box-filtered as the path tracer's is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bake_core.bundle import VolumeData
+from bake_core.picture import Picture
+from bake_core.probe_textures import probe_module, probe_textures
+from bake_core.scene import Camera, Lights, Scene
+from bake_core.shader_compiler import compile_glsl, shader_text
+from bake_core.shadow_views import NEAR, Batch, batches, corners, view_matrices
+from bake_core.vulkan import Bindings, Buffer, Commands, Device, Draw, Image, color_target, depth_target, graphics_pipeline, storage
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+# Bindings of verification/scene.glsl and picture.frag; the volumes' textures follow.
+_FIRST_PROBE_BINDING = 10
+# Samples a pixel: silhouettes and shadows then err by a sixteenth of a pixel, about what the path tracer's noise leaves of them.
+PIXEL_SAMPLES = 16
+
+
+class Rasterizer:
+    """A scene and a bundle's volumes on a device, ready for pictures.
+
+    Parameters
+    ----------
+    device : Device
+    scene : Scene
+    lights : Lights
+        All that shine, the spec's included, in the scene's local frame.
+    environment : (3,) float
+        Radiance of the background.
+    volumes : sequence of VolumeData
+        Each with an irradiance atlas.
+    """
+
+    def __init__(self, device: Device, scene: Scene, lights: Lights, environment: ArrayLike, volumes: Sequence[VolumeData]) -> None:
+        self._device = device
+        self._origin = scene.origin
+        self._bounds = scene.bounds - scene.origin
+        self._diagonal = float(np.linalg.norm(self._bounds[1] - self._bounds[0])) or 1.0
+        self._lights = lights
+        self._environment = np.asarray(environment, np.float64)
+        self._flags = float((len(scene.normals) > 0) + 2 * (len(scene.colors) > 0))
+        self._batches, size = batches(lights)
+        layers = max((b.views for b in self._batches), default=1)
+        self._shadows = depth_target(device, size, size, layers, sampled=True)
+        self._views = storage(device, layers * 128)
+        self._draws, transforms = _draws(scene)
+        resources = [
+            storage(device, scene.positions),
+            storage(device, scene.normals),
+            storage(device, scene.colors),
+            storage(device, scene.indices),
+            storage(device, _triangles(scene)),
+            storage(device, transforms),
+            storage(device, _materials(scene)),
+            storage(device, _light_rows(lights, self._batches)),
+            self._views,
+            self._shadows,
+        ]
+        assert len(resources) == _FIRST_PROBE_BINDING
+        bindings = Bindings(device, [*resources, *probe_textures(device, volumes)])
+        vertex_head = "#version 450\n" + shader_text("verification/scene.glsl")
+        shadow = compile_glsl(vertex_head + shader_text("verification/shadow.vert"), "vert", "shadow.vert")
+        vertex = compile_glsl(vertex_head + shader_text("verification/picture.vert"), "vert", "picture.vert")
+        fragment = compile_glsl(picture_fragment_shader(volumes, scene.origin), "frag", "picture.frag")
+        self._shadow_program = graphics_pipeline(device, shadow, None, bindings, 0)
+        self._program = graphics_pipeline(device, vertex, fragment, bindings, 3)
+        self._targets: dict[tuple[int, int], _Targets] = {}
+
+    def render(self, camera: Camera, width: int, height: int, *, samples: int = PIXEL_SAMPLES) -> Picture:
+        """What a camera (in world space) sees. Back faces of single-sided surfaces are culled.
+
+        Returns
+        -------
+        Picture
+            As :func:`bake_core.picture.path_trace_picture` gives.
+        """
+        if not self._draws:
+            return _empty(self._environment, width, height)
+        if (width, height) not in self._targets:
+            self._targets[width, height] = _Targets.make(self._device, width, height)
+        targets = self._targets[width, height]
+        lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
+        sums = np.zeros((3, height, width, 4))
+        receivers = self._visible(lens, targets)
+        for n, batch in enumerate(self._batches or [Batch(0, 0, 0)]):
+            self._draw_shadows(batch, receivers)
+            for i in range(samples):
+                shift = ((i + 0.5) / samples - 0.5, _radical_inverse(i) + 0.5 / samples - 0.5)
+                self._draw(lens, targets, shift, (batch.first, batch.last))
+                # Later batches add direct light only: the rest is the same each time.
+                for k in range(3 if n == 0 else 1):
+                    sums[k] += targets.download[k].read(np.float32, (height, width, 4))
+        mean = (sums / samples).astype(np.float32)
+        return Picture(direct=mean[0, ..., :3], indirect=mean[1, ..., :3], emission=mean[2, ..., :3], hit=mean[2, ..., 3])
+
+    def distances(self, camera: Camera, width: int, height: int) -> F64:
+        """Distance along the camera's axis to what pixel centres see, (height, width) float64 in metres; inf where nothing is."""
+        if not self._draws:
+            return np.full((height, width), np.inf)
+        if (width, height) not in self._targets:
+            self._targets[width, height] = _Targets.make(self._device, width, height)
+        lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
+        return self._distances(lens, self._targets[width, height])
+
+    def _distances(self, lens: _Lens, targets: _Targets) -> F64:
+        self._draw(lens, targets, (0.0, 0.0), (0, 0))
+        self._device.run(lambda commands: commands.download(targets.depth, targets.download[0]))
+        depth = targets.download[0].read(np.float32, (targets.depth.height, targets.depth.width)).astype(np.float64)
+        return np.divide(lens.near, depth, out=np.full_like(depth, np.inf), where=depth > 0)
+
+    def _visible(self, lens: _Lens, targets: _Targets) -> F64:
+        """Points on what the picture shows, for shadow maps to be fitted to; the scene's corners where it shows nothing."""
+        distances = self._distances(lens, targets)
+        rows, columns = np.nonzero(np.isfinite(distances))
+        if not rows.size:
+            return corners(self._bounds)
+        return lens.points(columns + 0.5, rows + 0.5, distances[rows, columns])
+
+    def _draw_shadows(self, batch: Batch, receivers: F64) -> None:
+        if not batch.views:
+            return
+        matrices = view_matrices(self._lights, batch, self._bounds, receivers, self._shadows.width)
+        pairs = np.stack([matrices, np.linalg.inv(matrices)], 1)
+        self._views.write(pairs.swapaxes(-1, -2).astype(np.float32))  # GLSL's matrices are stored by columns
+
+        def record(commands: Commands) -> None:
+            for layer, matrix in enumerate(matrices):
+                commands.draw(self._shadow_program, self._draws, _push(matrix), depth=self._shadows, layer=layer)
+
+        self._device.run(record)
+
+    def _draw(self, lens: _Lens, targets: _Targets, shift: tuple[float, float], lights: tuple[int, int]) -> None:
+        push = _push(lens.projection(*shift), [*lens.eye, self._flags], lights)
+        nothing, background = (0.0, 0.0, 0.0, 0.0), (*(float(x) for x in self._environment), 0.0)
+
+        def record(commands: Commands) -> None:
+            clear = [nothing, nothing, background]
+            commands.draw(self._program, self._draws, push, colors=targets.colors, depth=targets.depth, clear=clear)
+            for image, buffer in zip(targets.colors, targets.download, strict=True):
+                commands.download(image, buffer)
+
+        self._device.run(record)
+
+
+def picture_fragment_shader(volumes: Sequence[VolumeData], frame: ArrayLike) -> str:
+    """The verification's fragment shader for a bundle: scene, probes, the reference module, and what uses them."""
+    parts = (
+        "#version 450",
+        shader_text("verification/scene.glsl"),
+        probe_module(volumes, _FIRST_PROBE_BINDING, frame),
+        shader_text("verification/picture.frag"),
+    )
+    return "\n".join(parts)
+
+
+@dataclass(frozen=True)
+class _Targets:
+    """What one size of picture is drawn into, and where it is read from."""
+
+    colors: list[Image]
+    depth: Image
+    download: list[Buffer]
+
+    @classmethod
+    def make(cls, device: Device, width: int, height: int) -> _Targets:
+        colors = [color_target(device, width, height) for _ in range(3)]
+        return cls(colors, depth_target(device, width, height), [storage(device, c.bytes) for c in colors])
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera in the local frame. `axes` holds right, up and back as rows; `tangents` half the picture's width and height at distance 1."""
+
+    eye: F64
+    axes: F64
+    tangents: tuple[float, float]
+    near: float
+    width: int
+    height: int
+
+    @classmethod
+    def make(cls, camera: Camera, origin: F64, near: float, width: int, height: int) -> _Lens:
+        axes = camera.matrix[:3, :3].T / np.linalg.norm(camera.matrix[:3, :3], axis=0)[:, None]
+        half = math.tan(camera.yfov / 2)
+        return cls(camera.matrix[:3, 3] - origin, axes, (half * width / height, half), near, width, height)
+
+    def projection(self, x: float, y: float) -> F64:
+        """Local frame to reversed clip space, the sampled point moved by (x, y) pixels to the right and down. (4, 4)."""
+        right, up, back = self.axes
+        matrix = np.zeros((4, 4))
+        matrix[3, :3] = -back
+        matrix[3, 3] = back @ self.eye
+        matrix[0, :3], matrix[0, 3] = right / self.tangents[0], -right @ self.eye / self.tangents[0]
+        matrix[1, :3], matrix[1, 3] = -up / self.tangents[1], up @ self.eye / self.tangents[1]
+        matrix[2, 3] = self.near
+        matrix[:2] -= np.array([[2 * x / self.width], [2 * y / self.height]]) * matrix[3]
+        return matrix
+
+    def points(self, x: NDArray[np.floating], y: NDArray[np.floating], distance: F64) -> F64:
+        """Points of the local frame seen at pixels (x, y), so far along the camera's axis."""
+        right, up, back = self.axes
+        across = (2 * x / self.width - 1) * self.tangents[0] * distance
+        down = (2 * y / self.height - 1) * self.tangents[1] * distance
+        out: F64 = self.eye + across[:, None] * right - down[:, None] * up - distance[:, None] * back
+        return out
+
+
+def _empty(environment: F64, width: int, height: int) -> Picture:
+    nothing = np.zeros((height, width, 3), np.float32)
+    return Picture(nothing, nothing, np.broadcast_to(environment.astype(np.float32), nothing.shape).copy(), nothing[..., 0])
+
+
+def _draws(scene: Scene) -> tuple[list[Draw], F32]:
+    """One draw a mesh, and the transforms of all instances in the draws' order, (n, 3, 4)."""
+    first = scene.mesh_first_triangle
+    draws, transforms = [], [np.eye(3, 4)[None]]
+    if first[1] > first[0]:
+        draws.append(Draw(3 * int(first[1] - first[0]), 1, 3 * int(first[0]), 0))
+    used = 1
+    for mesh in range(1, len(first) - 1):
+        of_mesh = np.flatnonzero(scene.instance_mesh == mesh)
+        if of_mesh.size and first[mesh + 1] > first[mesh]:
+            draws.append(Draw(3 * int(first[mesh + 1] - first[mesh]), len(of_mesh), 3 * int(first[mesh]), used))
+            transforms.append(scene.instance_transform[of_mesh])
+            used += len(of_mesh)
+    return draws, np.concatenate(transforms).astype(np.float32)
+
+
+def _triangles(scene: Scene) -> F32:
+    """Front normal in the mesh's own space (zero where a triangle has no area) and material index, (t, 4)."""
+    v = scene.positions[scene.indices].astype(np.float64)
+    normal = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    return np.concatenate([normal, scene.triangle_material[:, None]], 1).astype(np.float32)
+
+
+def _materials(scene: Scene) -> F32:
+    """Base colour and 1 if double-sided; emission and 0, (m, 2, 4)."""
+    m = scene.materials
+    rows = np.zeros((len(m.name), 2, 4), np.float32)
+    rows[:, 0, :3], rows[:, 0, 3], rows[:, 1, :3] = m.base_color, m.double_sided, m.emission
+    return rows
+
+
+def _light_rows(lights: Lights, groups: Sequence[Batch]) -> F32:
+    """As picture.frag's ``arriving`` reads them, (n, 4, 4)."""
+    rows = np.zeros((len(lights.kind), 4, 4), np.float32)
+    rows[:, 0, :3], rows[:, 0, 3] = lights.position, lights.kind
+    rows[:, 1, :3], rows[:, 1, 3] = lights.direction, lights.range
+    rows[:, 2, :3] = lights.value
+    scale = 1 / np.maximum(0.001, lights.cos_inner.astype(np.float64) - lights.cos_outer)
+    rows[:, 3, 0], rows[:, 3, 1] = scale, -lights.cos_outer * scale
+    for batch in groups:
+        rows[batch.first : batch.last, 2, 3] = batch.first_view
+        rows[batch.first : batch.last, 3, 2] = batch.view_count
+    return rows
+
+
+def _push(matrix: F64, camera: Sequence[float] = (0, 0, 0, 0), lights: tuple[int, int] = (0, 0)) -> bytes:
+    return matrix.T.astype(np.float32).tobytes() + np.array(camera, np.float32).tobytes() + np.array([*lights, 0, 0], np.int32).tobytes()
+
+
+def _radical_inverse(i: int) -> float:
+    """Van der Corput's sequence in base 2: with i/n, points that are spread evenly in both directions."""
+    return int(f"{i:032b}"[::-1], 2) / 2**32
