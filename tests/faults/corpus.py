@@ -283,9 +283,7 @@ def _field_faults() -> Iterator[Fault]:
     yield _edit("an index of 300 digits", "index_out_of_range", "nodes[0].mesh", ("nodes/0/mesh", 10**300))
     yield _edit("skin out of range", "index_out_of_range", "nodes[0].skin", ("nodes/0/skin", 0))
     texture = "materials[0].pbrMetallicRoughness.baseColorTexture.index"
-    yield _edit(
-        "texture out of range", "index_out_of_range", texture, ("materials/0/pbrMetallicRoughness/baseColorTexture", {"index": 0})
-    )
+    yield _edit("texture out of range", "index_out_of_range", texture, ("materials/0/pbrMetallicRoughness/baseColorTexture", {"index": 0}))
 
     for name, path, where, value in (
         ("count of 1e9", "accessors/0/count", "accessors[0].count", 10**9),
@@ -463,7 +461,10 @@ def _data_faults() -> Iterator[Fault]:
     yield _glb("NaN colour", "not_finite", "accessors[2]", patched(offset[2], FLOAT32_NAN))
     yield _glb("a position of 3e38", "overflow", "meshes[0]", patched(offset[0], FLOAT32_HUGE))
     yield _glb(
-        "a position of 3e38 in a mesh used once", "overflow", "node 'floor' (nodes[0])", patched(offset[0], FLOAT32_HUGE, ("nodes/2/mesh", _REMOVE))
+        "a position of 3e38 in a mesh used once",
+        "overflow",
+        "node 'floor' (nodes[0])",
+        patched(offset[0], FLOAT32_HUGE, ("nodes/2/mesh", _REMOVE)),
     )
     place = "meshes[0].primitives[0].indices"
     yield _glb("vertex index out of range", "index_out_of_range", place, patched(offset[3] + 5, b"\x04"))
@@ -531,14 +532,22 @@ def _data_faults() -> Iterator[Fault]:
     inside = "accessors/0/sparse"
     yield sparse_fault("count of 1e9", "out_of_range", "accessors[0].sparse.count", (f"{inside}/count", 10**9))
     yield sparse_fault("no values", "missing_key", "accessors[0].sparse.values.bufferView", (f"{inside}/values", _REMOVE))
-    yield sparse_fault("view out of range", "index_out_of_range", "accessors[0].sparse.indices.bufferView", (f"{inside}/indices/bufferView", 9))
-    yield sparse_fault("indices of float", "out_of_range", "accessors[0].sparse.indices.componentType", (f"{inside}/indices/componentType", 5126))
+    yield sparse_fault(
+        "view out of range", "index_out_of_range", "accessors[0].sparse.indices.bufferView", (f"{inside}/indices/bufferView", 9)
+    )
+    yield sparse_fault(
+        "indices of float", "out_of_range", "accessors[0].sparse.indices.componentType", (f"{inside}/indices/componentType", 5126)
+    )
     yield sparse_fault("indices overrun", "accessor_out_of_view", "accessors[0].sparse.indices.count", (f"{inside}/indices/byteOffset", 5))
     yield sparse_fault("values overrun", "accessor_out_of_view", "accessors[0].sparse.values.count", (f"{inside}/values/byteOffset", 40))
     yield sparse_fault("indices fall", "bad_accessor", "accessors[0].sparse.indices", (f"{inside}/indices/byteOffset", 2))
-    yield sparse_fault("indices past the end", "bad_accessor", "accessors[0].sparse.indices", ("accessors/0/count", 2), *(
-        (f"accessors/{i}/count", 2) for i in (1, 2)
-    ))
+    yield sparse_fault(
+        "indices past the end",
+        "bad_accessor",
+        "accessors[0].sparse.indices",
+        ("accessors/0/count", 2),
+        *((f"accessors/{i}/count", 2) for i in (1, 2)),
+    )
     yield sparse_fault(
         "a million zeros and more", "too_large", "accessors[0].count", ("accessors/0/bufferView", _REMOVE), ("accessors/0/count", 10**9)
     )
