@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.atlas import Layout, choose_encoding, layout, pack
+from bake_core import __version__
+from bake_core.atlas import choose_encoding, layout, pack
 from bake_core.bundle import CHANNELS, FORMAT, SHADERS, VERSION, Atlas, VolumeData, digest_file
 from bake_core.capture import SCRAMBLES
 from bake_core.convergence import Verdict
@@ -40,14 +40,6 @@ PARAMETERS = {
 # Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
 # flat-wall variances come out negative). Distances are metres of any scale.
 _ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
-
-
-def generator() -> str:
-    """``octobake VERSION``."""
-    try:
-        return f"octobake {version('octobake')}"
-    except PackageNotFoundError:
-        return "octobake (not installed)"
 
 
 def assemble(
@@ -83,7 +75,7 @@ def assemble(
     return {
         "format": FORMAT,
         "version": VERSION,
-        "generator": generator(),
+        "generator": f"octobake {__version__}",
         "instruction_set": instruction_set(),
         "scene": {"digest": scene.digest, "triangles": scene.triangle_count, "ignored": list(scene.ignored)},
         "spec": spec.canonical(),
@@ -104,13 +96,18 @@ def _volume(
     maps = {output: _interior(output, selection, state, probes) for output in selection.outputs}
     tiles = [m.shape[1] + 2 for m in maps.values()]
     shape = layout(volume.counts, max(tiles))
-    atlases, described = {}, []
+    atlases: dict[str, Atlas] = {}
+    described = []
     for output, interior in maps.items():
         if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
             bad = int(np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0])
-            raise BakeError("bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}")
+            raise BakeError(
+                "bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}"
+            )
         encoding, cost = ("float", 0.0) if output in _ALWAYS_FULL else choose_encoding(interior)
-        atlas = Atlas(output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding)
+        atlas = Atlas(
+            output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding
+        )
         file = f"{volume.name}.{output}.exr"
         _write_layers(folder / file, atlas.texels, output, half=encoding == "half")
         entry: dict[str, Any] = {
@@ -174,10 +171,11 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
     # Never a silent inf: what does not fit float32 is caught where maps are checked.
     with np.errstate(over="ignore"):
         if output == "irradiance":
-            # The covariance term is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard error.
+            # The covariance term is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard
+            # error.
             mean = np.maximum(state.irradiance[probes].sum(1) / state.samples, 0)
-            return mean.reshape(-1, selection.irradiance, selection.irradiance, 3).astype(np.float32)
-        return (state.radiance[probes] / state.samples).reshape(-1, selection.capture, selection.capture, 3).astype(np.float32)
+            return np.asarray(mean, np.float32).reshape(-1, selection.irradiance, selection.irradiance, 3)
+        return np.asarray(state.radiance[probes] / state.samples, np.float32).reshape(-1, selection.capture, selection.capture, 3)
 
 
 def _write_layers(path: Path, texels: F32, output: str, *, half: bool) -> None:

@@ -78,7 +78,7 @@ def pack(interior: F32, shape: Layout) -> F32:
 
 def unpack(texels: F32, shape: Layout, n: int) -> F32:
     """Every probe's map without its border, (n, t, t, channels). Inverse of :func:`pack`."""
-    layers, height, width, channels = texels.shape
+    layers, height, _, channels = texels.shape
     side = height // shape.rows
     grid = texels.reshape(layers, shape.rows, side, shape.columns, side, channels).transpose(0, 1, 3, 2, 4, 5)
     return np.ascontiguousarray(grid.reshape(-1, side, side, channels)[:n, 1:-1, 1:-1])

@@ -14,6 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
     """Half-open ranges of probes, as equal as they go; never an empty one."""
     shards = max(1, min(shards, probe_count))
     edges = [probe_count * i // shards for i in range(shards + 1)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))
 
 
 def empty_state(prepared: Prepared) -> State:

@@ -34,7 +34,10 @@ Verdict = Literal["continue", "target", "samples", "time"]
 
 @dataclass(frozen=True)
 class Point:
-    """One point of a job's curve of error against run time. `error` is None where it cannot be measured (fewer than two samples a scramble)."""
+    """One point of a job's curve of error against run time.
+
+    `error` is None where it cannot be measured (fewer samples than scrambles).
+    """
 
     samples: int
     seconds: float

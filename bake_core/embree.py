@@ -23,7 +23,8 @@ from bake_core.kernels import kernel
 from bake_core.scene import Scene
 
 # RTCRayHit of Embree 4.4 as embreex builds it (RTC_MAX_INSTANCE_LEVEL_COUNT 1, instPrimID compiled in), in 4-byte words:
-#  0-2 origin, 3 tnear, 4-6 direction, 7 time, 8 tfar, 9 mask, 10 id, 11 flags, 12-14 Ng, 15-16 u v, 17 primID, 18 geomID, 19 instID, 20 instPrimID
+#  0-2 origin, 3 tnear, 4-6 direction, 7 time, 8 tfar, 9 mask, 10 id, 11 flags, 12-14 Ng, 15-16 u v, 17 primID, 18 geomID, 19 instID, 20
+#  instPrimID
 RAYHIT_WORDS = 24
 # Rays are 16-byte aligned; a cache line keeps a ray from straddling two.
 RAYHIT_ALIGNMENT = 64
@@ -102,7 +103,7 @@ def new_rayhit() -> NDArray[np.float32]:
     return raw[start : start + RAYHIT_WORDS * 4].view(np.float32)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
     """Fill a ray for either query; `ray_bits` is the same memory seen as uint32."""
     ray[0], ray[1], ray[2], ray[3] = ox, oy, oz, np.float32(0)

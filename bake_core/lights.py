@@ -173,7 +173,7 @@ def environment_radiance(spec: Spec) -> F64:
     return np.asarray(spec.environment.radiance, np.float64)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def choose(cdf, u):  # type: ignore[no-untyped-def]
     """First index whose running sum exceeds u: an index, and its chance."""
     low, high = 0, cdf.shape[0] - 1
@@ -186,7 +186,7 @@ def choose(cdf, u):  # type: ignore[no-untyped-def]
     return low, cdf[low] - (cdf[low - 1] if low else 0.0)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def toward_light(lights, i, px, py, pz):  # type: ignore[no-untyped-def]
     """From a point to light i: unit direction, distance (inf for directional), irradiance over value on a plane facing it.
 

@@ -53,7 +53,7 @@ def material_table(scene: Scene) -> MaterialTable:
     return MaterialTable(np.ascontiguousarray(m.base_color), np.ascontiguousarray(m.emission), np.ascontiguousarray(m.double_sided))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def lambert_cosine(wx, wy, wz, n):  # type: ignore[no-untyped-def]
     """(wi·ns)+ + (mirror(wi)·ns)+ for wi above the surface, else 0; over π it is the pdf of :func:`sample_lambert`.
 
@@ -67,7 +67,7 @@ def lambert_cosine(wx, wy, wz, n):  # type: ignore[no-untyped-def]
     return max(direct, 0.0) + max(mirrored, 0.0)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def sample_lambert(u, v, n):  # type: ignore[no-untyped-def]
     """A direction with pdf :func:`lambert_cosine` / π; `n` as there."""
     lx, ly, lz = cosine_hemisphere(u, v)

@@ -34,7 +34,8 @@ def dir_to_oct(w: NDArray[np.floating]) -> NDArray[np.floating]:
     w = np.asarray(w)
     p = w[..., :2] / np.abs(w).sum(axis=-1, keepdims=True)
     folded = (1 - np.abs(p[..., ::-1])) * np.where(p >= 0, 1, -1).astype(w.dtype)
-    return np.where(w[..., 2:] < 0, folded, p)
+    square: NDArray[np.floating] = np.where(w[..., 2:] < 0, folded, p)
+    return square
 
 
 def oct_to_dir(oct_xy: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -111,8 +112,8 @@ def texel_solid_angles(n: int) -> F64:
     """
     t = texel_triangles(n)
     a, b, c = t[..., 0, :], t[..., 1, :], t[..., 2, :]
-    dot = lambda u, v: (u * v).sum(-1)  # noqa: E731
-    omega = 2 * np.arctan2(np.abs(dot(a, np.cross(b, c))), 1 + dot(a, b) + dot(b, c) + dot(c, a))
+    triple = np.abs((a * np.cross(b, c)).sum(-1))
+    omega = 2 * np.arctan2(triple, 1 + (a * b).sum(-1) + (b * c).sum(-1) + (c * a).sum(-1))
     total: F64 = omega.sum(-1)
     return total
 

@@ -69,7 +69,7 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
                 dy = axes[2, 1] + x * axes[0, 1] + y * axes[1, 1]
                 dz = axes[2, 2] + x * axes[0, 2] + y * axes[1, 2]
                 length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                emitted, direct, indirect, hit = trace_path(
+                emitted, direct, indirect, hit, _ = trace_path(
                     t, ray, ray_bits, eye[0], eye[1], eye[2], dx / length, dy / length, dz / length, reversed_index, index, key, True
                 )
                 for c in range(3):

@@ -115,7 +115,9 @@ def _fit_node(scene: Scene, volume: VolumeSpec, name: str, where: str) -> Volume
     off_axis = np.sqrt(np.maximum(lengths**2 - aligned**2, 0))
     if sorted(world_axis) != [0, 1, 2] or (lengths <= 0).any() or (off_axis > _TURNED * lengths).any():
         raise SpecError(
-            "spec.node_not_aligned", f"node {volume.node!r} is turned by other than 90° about an axis, sheared, or has no size", f"{where}.node"
+            "spec.node_not_aligned",
+            f"node {volume.node!r} is turned by other than 90° about an axis, sheared, or has no size",
+            f"{where}.node",
         )
     assert volume.counts is not None
     counts, size = np.empty(3, int), np.empty(3)

@@ -61,7 +61,13 @@ def plan(scene: Scene, spec: Spec, *, threads: int) -> Plan:
     n, s = prepared.probe_count, prepared.selection
     speed = _paths_per_second(prepared, threads)
     state_bytes = sum(a.nbytes for a in vars(empty_state(prepared)).values() if isinstance(a, np.ndarray))
-    texels = {"irradiance": (s.irradiance, 6), "visibility": (s.visibility, 8), "radiance": (s.capture, 6), "distance": (s.distance, 4), "normal": (s.normal, 6)}
+    texels = {
+        "irradiance": (s.irradiance, 6),
+        "visibility": (s.visibility, 8),
+        "radiance": (s.capture, 6),
+        "distance": (s.distance, 4),
+        "normal": (s.normal, 6),
+    }
     atlas_bytes = sum(n * (texels[o][0] + 2) ** 2 * texels[o][1] for o in s.outputs)
     return Plan(
         volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),

@@ -54,7 +54,9 @@ def _page(manifest: dict[str, Any], document: dict[str, Any]) -> str:
         "scene": manifest["scene"]["digest"],
         "bundle": document["content_digest"],
     }
-    atlases = [(v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"]) for v in manifest["volumes"] for a in v["atlases"]]
+    atlases = [
+        (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"]) for v in manifest["volumes"] for a in v["atlases"]
+    ]
     curve = [(p["samples"], f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
     left_out = [(x["what"], x["why"]) for x in manifest["left_out"]]
     return (

@@ -17,7 +17,7 @@ STRATIFIED_VERTICES = 8
 _PI = np.float32(math.pi)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def mix64(x):  # type: ignore[no-untyped-def]
     """A bijection of 64-bit words that looks random.
 
@@ -29,7 +29,7 @@ def mix64(x):  # type: ignore[no-untyped-def]
     return x ^ (x >> uint64(31))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def reverse_bits(x):  # type: ignore[no-untyped-def]
     x = uint32(x)
     x = ((x >> uint32(1)) & uint32(0x55555555)) | ((x & uint32(0x55555555)) << uint32(1))
@@ -39,7 +39,7 @@ def reverse_bits(x):  # type: ignore[no-untyped-def]
     return uint32((x >> uint32(16)) | (x << uint32(16)))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def scramble_reversed(x, seed):  # type: ignore[no-untyped-def]
     """A nested uniform (Owen) scramble of a word whose bits are reversed: bit i is flipped by a hash of the bits below it.
 
@@ -55,7 +55,7 @@ def scramble_reversed(x, seed):  # type: ignore[no-untyped-def]
     return uint32(x ^ uint32(x * uint32(0x53A22864)))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def pascal(x):  # type: ignore[no-untyped-def]
     """Bits times Pascal's triangle mod 2: the second Sobol' dimension with reversed bits.
 
@@ -69,13 +69,13 @@ def pascal(x):  # type: ignore[no-untyped-def]
     return uint32(x ^ (x >> uint32(16)))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def unit_float(x):  # type: ignore[no-untyped-def]
     """The upper 24 bits as a float32 in [0, 1): never 1, which a rounding of all 32 bits would give."""
     return np.float32(uint32(x) >> uint32(8)) * np.float32(2.0**-24)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def sobol_pair(reversed_index, key):  # type: ignore[no-untyped-def]
     """One point of an Owen-scrambled (0, 2)-sequence in base 2, in shuffled order.
 
@@ -100,14 +100,14 @@ def sobol_pair(reversed_index, key):  # type: ignore[no-untyped-def]
     return unit_float(x), unit_float(y)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def random_pair(index, key):  # type: ignore[no-untyped-def]
     """Two plain random numbers in [0, 1), a function of (index, key)."""
     h = mix64(uint64(key) + uint64(index) * uint64(0x9E3779B97F4A7C15))
     return unit_float(uint32(h)), unit_float(uint32(h >> uint64(32)))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
     """Directions around +Z with pdf cosθ/π, by the concentric map (Shirley and Chiu 1997, "A Low Distortion Map Between Disk and Square").
 
@@ -128,13 +128,13 @@ def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
     return x, y, np.float32(math.sqrt(max(np.float32(0), np.float32(1) - r * r)))
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def cosine_hemisphere_pdf(z):  # type: ignore[no-untyped-def]
     """Per solid angle, of :func:`cosine_hemisphere`."""
     return max(z, np.float32(0)) / _PI
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def cosine_hemisphere_inverse(x, y):  # type: ignore[no-untyped-def]
     """The square's point that :func:`cosine_hemisphere` takes to (x, y, ·)."""
     r = math.sqrt(x * x + y * y)
@@ -154,7 +154,7 @@ def cosine_hemisphere_inverse(x, y):  # type: ignore[no-untyped-def]
     return (a + 1) / 2, (b + 1) / 2
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def uniform_triangle(u, v):  # type: ignore[no-untyped-def]
     """Barycentrics (of vertices 1 and 2) uniform over a triangle's area.
 
@@ -168,7 +168,7 @@ def uniform_triangle(u, v):  # type: ignore[no-untyped-def]
     return u - b2, b2
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def uniform_triangle_inverse(b1, b2):  # type: ignore[no-untyped-def]
     """The square's point that :func:`uniform_triangle` takes to (b1, b2)."""
     if b2 > b1:
@@ -176,7 +176,7 @@ def uniform_triangle_inverse(b1, b2):  # type: ignore[no-untyped-def]
     return b1 + b2, b2 * 2
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
     """Two tangents that make a right-handed basis with a unit normal.
 

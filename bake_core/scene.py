@@ -115,7 +115,8 @@ class Scene:
     triangle_material : (t,) uint32
     mesh_first_triangle : (m + 1,) int64
         Mesh i owns triangles [mesh_first_triangle[i], mesh_first_triangle[i + 1]).
-        Mesh 0 is everything that occurs once, already in the local frame (it may be empty); meshes 1.. are prototypes, used by instances only.
+        Mesh 0 is everything that occurs once, already in the local frame (it may be empty); meshes 1.. are prototypes, used by instances
+        only.
     instance_mesh : (i,) int32
         The prototype of each instance, ≥ 1.
     instance_transform : (i, 3, 4) float64

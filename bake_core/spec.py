@@ -181,9 +181,7 @@ class Spec(_Model):
     def canonical(self) -> dict[str, Any]:
         """The spec with every default filled in: what the manifest records and what identity is judged by."""
         spec: dict[str, Any] = self.model_dump(mode="json")
-        spec["volumes"] = [
-            {"name": v.name or f"v{i}", **v.model_dump(mode="json", exclude_none=True)} for i, v in enumerate(self.volumes)
-        ]
+        spec["volumes"] = [{"name": v.name or f"v{i}", **v.model_dump(mode="json", exclude_none=True)} for i, v in enumerate(self.volumes)]
         return spec
 
 
@@ -193,7 +191,8 @@ def parse_spec(document: Any, where: str = "spec") -> Spec:
     Raises
     ------
     SpecError
-        ``spec.unknown_key``, ``spec.missing_key``, ``spec.too_many_probes``, ``spec.not_finite`` or ``spec.invalid``; `where` is the path of the field, as in
+        ``spec.unknown_key``, ``spec.missing_key``, ``spec.too_many_probes``, ``spec.not_finite`` or ``spec.invalid``; `where` is the
+        path of the field, as in
         ``volumes[0].spacing[1]``.
     """
     try:
@@ -218,8 +217,8 @@ def load_spec(path: str | Path) -> Spec:
 def _spec_error(error: ValidationError, where: str) -> SpecError:
     """Pydantic's first complaint as one line with a place; how many more there are is said."""
     details = error.errors(include_url=False)
-    # An unknown key explains the errors that follow from it, so it goes first.
-    first = min(details, key=lambda d: d["type"] != "extra_forbidden")
+    # Of a union's complaints the deepest is about what was meant; an unknown key explains the errors that follow from it, so it goes first.
+    first = min(details, key=lambda d: (d["type"] != "extra_forbidden", "literal['auto']" in d["loc"] or d["loc"][-1:] == ("outputs",)))
     place = where
     path = ""
     for i, part in enumerate(first["loc"]):

@@ -39,7 +39,8 @@ from bake_core.spec import Spec
 # furnace of albedo a has a relative σ of τ√a from roulette: 10 % of a path here, against 100 % where τ = 1.
 ROULETTE_THROUGHPUT = 0.1
 # Where throughput does not fall (white walls), a path that has met no light for m > 16 vertices goes on with chance (m/(m+1))². Survival
-# falls as 1/m², slower than any physical decay, so the variance stays finite; yet in a sealed dark room a path takes 32 vertices on average.
+# falls as 1/m², slower than any physical decay, so the variance stays finite; yet in a sealed dark room a path takes 32 vertices on
+# average.
 ROULETTE_DARK_VERTICES = 16
 # The same against light that never dies away (a sealed box of albedo 1 with an emitter in it has no finite answer): late enough that no
 # path of an albedo below 0.999 gets here.
@@ -123,7 +124,7 @@ def _normal_matrices(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     """What a hit found, from the RTCRayHit it left behind.
 
@@ -216,7 +217,7 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
     """Whether anything lies between a point and the light."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
@@ -224,11 +225,24 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
     return ray[8] < 0
 
 
-@kernel  # type: ignore[untyped-decorator]
-def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-untyped-def]
-    """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
+@kernel
+def pdf_emitter(t, strength, two_sided, d2, facing):
+    """Per solid angle, of :func:`sample_emitter`, seen from a distance of √d2 under a cosine of `facing` at the emitter."""
+    sides = 2.0 if two_sided else 1.0
+    return strength * sides / t.emitters.total * d2 / max(facing, 1e-30)
 
-    The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
+
+@kernel
+def sample_emitter(t, px, py, pz, u, v, w):
+    """A point on the emissive triangles, chosen by power and area, as seen from a point.
+
+    Pdf: :func:`pdf_emitter`.
+
+    Returns
+    -------
+    (int, 3 float64, float64, 3 float64)
+        The triangle, the unit direction to the point, its pdf per solid angle (0: it shines the other way), and the point lifted off its surface
+        towards the viewer, so that the emitter does not block itself.
     """
     e = t.emitters
     i, _ = choose(e.cdf, float(w))
@@ -237,32 +251,42 @@ def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-
     x = b0 * e.vertices[i, 0, 0] + b1 * e.vertices[i, 1, 0] + b2 * e.vertices[i, 2, 0]
     y = b0 * e.vertices[i, 0, 1] + b1 * e.vertices[i, 1, 1] + b2 * e.vertices[i, 2, 1]
     z = b0 * e.vertices[i, 0, 2] + b1 * e.vertices[i, 1, 2] + b2 * e.vertices[i, 2, 2]
-    dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    dx, dy, dz = x - px, y - py, z - pz
     d2 = dx * dx + dy * dy + dz * dz
-    if d2 <= 0:
-        return 0.0, 0.0, 0.0
     d = math.sqrt(d2)
-    cosine = lambert_cosine(dx / d, dy / d, dz / d, n)
-    facing = -(dx * e.normal[i, 0] + dy * e.normal[i, 1] + dz * e.normal[i, 2]) / d
-    sides = 1.0
-    if e.double_sided[i]:
-        sides = 2.0
-    side = 1.0 if facing > 0 else -1.0
-    if cosine <= 0 or facing == 0 or (side < 0 and sides == 1.0):
-        return 0.0, 0.0, 0.0
-    # Both ends leave their surfaces, so that neither of them blocks.
+    pdf = 0.0
+    side = 1.0
+    if d > 0:
+        dx, dy, dz = dx / d, dy / d, dz / d
+        facing = -(dx * e.normal[i, 0] + dy * e.normal[i, 1] + dz * e.normal[i, 2])
+        side = 1.0 if facing > 0 else -1.0
+        if facing > 0 or (facing < 0 and e.double_sided[i]):
+            strength = e.radiance[i, 0] + e.radiance[i, 1] + e.radiance[i, 2]
+            pdf = pdf_emitter(t, strength, e.double_sided[i], d2, facing * side)
     lift = side * _EPSILON * (abs(x) + abs(y) + abs(z))
-    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-    tx, ty, tz = x + lift * e.normal[i, 0] - ox, y + lift * e.normal[i, 1] - oy, z + lift * e.normal[i, 2] - oz
-    if blocked(t, ray, ray_bits, ox, oy, oz, tx, ty, tz, np.float32(1.0)):
+    lifted = (x + lift * e.normal[i, 0], y + lift * e.normal[i, 1], z + lift * e.normal[i, 2])
+    return i, (dx, dy, dz), pdf, lifted
+
+
+@kernel
+def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):
+    """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
+
+    The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
+    """
+    i, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
+    cosine = lambert_cosine(d[0], d[1], d[2], n)
+    if pdf <= 0 or cosine <= 0:
         return 0.0, 0.0, 0.0
-    weight = e.radiance[i, 0] + e.radiance[i, 1] + e.radiance[i, 2]
-    pdf_light = weight * sides / e.total * d2 / (facing * side)
-    gain = cosine * INV_PI / (pdf_light + cosine * INV_PI)
-    return gain * e.radiance[i, 0], gain * e.radiance[i, 1], gain * e.radiance[i, 2]
+    # Both ends have left their surfaces, so that neither of them blocks.
+    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    if blocked(t, ray, ray_bits, ox, oy, oz, end[0] - ox, end[1] - oy, end[2] - oz, np.float32(1.0)):
+        return 0.0, 0.0, 0.0
+    gain = cosine * INV_PI / (pdf + cosine * INV_PI)
+    return gain * t.emitters.radiance[i, 0], gain * t.emitters.radiance[i, 1], gain * t.emitters.radiance[i, 2]
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-def]
     """Light from one punctual or directional light, chosen by weight: Σ f cosθ E over albedo, unbiased."""
     i, chance = choose(t.lights.cdf, float(u))
@@ -277,7 +301,7 @@ def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-
     return gain * t.lights.value[i, 0], gain * t.lights.value[i, 1], gain * t.lights.value[i, 2]
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: ignore[no-untyped-def]
     """Nearest hit; with `through_backs`, back faces of single-sided materials are passed, as a rasteriser that culls them does.
 
@@ -293,11 +317,11 @@ def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: 
             return True, s
         # Leave on the far side: the surface's normal looks back at us.
         ox, oy, oz = s[0][0] - s[2] * s[1][0], s[0][1] - s[2] * s[1][1], s[0][2] - s[2] * s[1][2]
-    zero = 0.0
-    return False, ((zero, zero, zero), (zero, zero, zero, zero, zero, zero), zero, (zero, zero, zero), t.triangle_material.dtype.type(0), True)
+    nothing = (0.0, 0.0, 0.0)
+    return False, (nothing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, nothing, np.uint32(0), True)
 
 
-@kernel  # type: ignore[untyped-decorator]
+@kernel
 def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera):  # type: ignore[no-untyped-def]
     """One path.
 
@@ -323,6 +347,8 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Reflected at the first surface, all the rest.
     hit : bool
         Whether the ray met a surface.
+    emitter_pdf : float64
+        With which density :func:`sample_emitter` would have found what the ray met; 0 where it is no emissive triangle.
     """
     emitted_r = emitted_g = emitted_b = 0.0
     direct_r = direct_g = direct_b = 0.0
@@ -334,6 +360,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     dark = 0
     pdf = 0.0
     hit_any = False
+    emitter_pdf = 0.0
     depth = 0
     has_emitters = t.emitters.cdf.shape[0] > 0
     has_lights = t.lights.cdf.shape[0] > 0
@@ -363,14 +390,13 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         strength = le_r + le_g + le_b
         if strength > 0:
             dark = 0
+            hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
+            facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
+                emitter_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
             else:
-                hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
-                facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
-                sides = 2.0 if two_sided else 1.0
-                pdf_light = strength * sides / t.emitters.total * (hx * hx + hy * hy + hz * hz) / max(facing, 1e-30)
-                gain = pdf / (pdf + pdf_light) / survival
+                gain = pdf / (pdf + pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)) / survival
                 indirect_r += beta_r * gain * le_r
                 indirect_g += beta_g * gain * le_g
                 indirect_b += beta_b * gain * le_b
@@ -427,7 +453,4 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
         pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any
-
-
-
+    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, emitter_pdf

@@ -43,13 +43,11 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
     ]
     for v in manifest["volumes"]:
         probes = v["probes"]
-        lines.append(
-            f"volume     {v['name']}: {'×'.join(map(str, v['counts']))} probes, {probes['active']} active, {probes['count'] - probes['active']} inside geometry"
-        )
-        lines += [
-            f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {percent(a['encoding_error'])}: {a['file']}"
-            for a in v["atlases"]
-        ]
+        counts, inside = "×".join(map(str, v["counts"])), probes["count"] - probes["active"]
+        lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry")
+        for a in v["atlases"]:
+            cost = percent(a["encoding_error"])
+            lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {a['file']}")
     lines += [f"left out   {x['what']}: {x['why']}" for x in manifest["left_out"]]
     lines += [f"ignored    {line}" for line in manifest["scene"]["ignored"]]
     if report is not None:

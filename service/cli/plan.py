@@ -37,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"kept       {', '.join(made.outputs)}")
     for what, why in made.left_out:
         print(f"left out   {what}: {why}")
-    print(f"seconds    {made.seconds:.1f} at most ({made.paths_per_second / 1e6:.2f} M paths/s on {args.threads} threads, {spec.stop.max_samples} samples)")
+    speed = f"{made.paths_per_second / 1e6:.2f} M paths/s on {args.threads} threads"
+    print(f"seconds    {made.seconds:.1f} at most, at {speed} for {spec.stop.max_samples} samples")
     print(f"memory     {made.memory_bytes / 1e6:.0f} MB")
     print(f"atlases    {made.atlas_bytes / 1e6:.1f} MB before compression")
     return 0

@@ -14,7 +14,9 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("sample", help="irradiance at points, by the same mathematics as the GLSL module")
     parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="a folder or a zip")
     parser.add_argument("--at", metavar="X,Y,Z", type=vector, action="append", default=[], help="a point, world, metres; may be repeated")
-    parser.add_argument("--normal", metavar="X,Y,Z", type=vector, action="append", default=[], help="its normal, any length; one for each --at")
+    parser.add_argument(
+        "--normal", metavar="X,Y,Z", type=vector, action="append", default=[], help="its normal, any length; one for each --at"
+    )
     parser.add_argument("--points", metavar="FILE.json", type=Path, help='[{"position": [x,y,z], "normal": [x,y,z]}, ...]')
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.set_defaults(run=run)
