@@ -175,20 +175,24 @@ def _read_group(group: list[Primitive], accessors: Accessors, row_of: Mapping[in
     positions = accessors.floats(first.position)
     corners = np.concatenate([_triangles(p, accessors, len(positions)) for p in group])
     material = np.repeat([row_of[p.material] for p in group], [p.triangle_count for p in group]).astype(np.uint32)
-    normals = _unit(accessors.floats(first.normal)) if first.normal is not None else None
-    colors = _rgba(accessors.floats(first.color)) if first.color is not None else None
-    used = np.zeros(len(positions), np.bool_)
-    used[corners] = True
-    if used.all():
-        triangles = corners.astype(np.uint32)
-    else:
-        triangles = (np.cumsum(used) - 1).astype(np.uint32)[corners]
-        positions = positions[used]
-        normals = normals[used] if normals is not None else None
-        colors = colors[used] if colors is not None else None
+    used, triangles = _renumber(corners, len(positions))
+    positions = np.ascontiguousarray(positions[used])
+    normals = _unit(accessors.floats(first.normal)[used]) if first.normal is not None else None
+    colors = _rgba(accessors.floats(first.color)[used]) if first.color is not None else None
     if normals is not None and _say_nothing(normals, positions, triangles):
         normals = None
-    return Mesh(np.ascontiguousarray(positions), normals, colors, triangles, material)
+    return Mesh(positions, normals, colors, triangles, material)
+
+
+def _renumber(corners: NDArray[np.integer], vertices: int) -> tuple[NDArray[np.integer] | NDArray[np.bool_], U32]:
+    """Which of so many vertices occur in (t, 3) `corners`, and the corners as indices into those."""
+    # Many small meshes may share one large list of vertices: then a table of it for each of them would cost far more than sorting.
+    if corners.size < vertices // 8:
+        used, triangles = np.unique(corners, return_inverse=True)
+        return used, triangles.reshape(corners.shape).astype(np.uint32)
+    occurs = np.zeros(vertices, np.bool_)
+    occurs[corners] = True
+    return occurs, (np.cumsum(occurs) - 1).astype(np.uint32)[corners]
 
 
 def _triangles(p: Primitive, accessors: Accessors, vertices: int) -> NDArray[np.integer]:

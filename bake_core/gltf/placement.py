@@ -16,6 +16,8 @@ from bake_core.scene import F32, F64, I32, I64, U32
 MAX_COORDINATE = 1e18
 # Rays are taken into a prototype's space in float32: through a flatter transform, nothing would be left of their accuracy.
 MIN_FLATNESS = 1e-5
+# Products of vertices and instances that one side of the world's box may cost, about a second.
+MAX_BOX_WORK = 1 << 31
 # Below this a transform has no inverse that float64 knows: it leaves a plane, a line or a point.
 SINGULAR = 1e-14
 
@@ -169,7 +171,8 @@ def _instances_box(vertices: F64, transform: F64) -> F64:
 def _furthest(vertices: F64, rows: F64, offset: F64) -> float:
     """Largest, over i and v, of rows[i]·v + offset[i], without going through every vertex of every instance.
 
-    A prototype's box bounds what each instance can reach; in falling order of that bound, few instances need a closer look.
+    A prototype's box bounds what each instance can reach; in falling order of that bound, few instances need a closer look. Where
+    they are not few (`MAX_BOX_WORK`), the bound stands for the rest.
     """
     low, high = _box(vertices)
     bound = np.where(rows > 0, rows * high, rows * low).sum(axis=1) + offset
@@ -180,6 +183,8 @@ def _furthest(vertices: F64, rows: F64, offset: F64) -> float:
             break
         key = rows[i].tobytes()
         if key not in reach:
+            if len(reach) * len(vertices) > MAX_BOX_WORK:
+                return float(bound[i])
             reach[key] = float((vertices @ rows[i]).max())
         best = max(best, reach[key] + offset[i])
     return best

@@ -98,7 +98,8 @@ _REMOVE = object()
 
 
 def _put(document: Any, path: str, value: Any) -> None:
-    *steps, last = [int(s) if s.isdecimal() else s for s in path.split("/")]
+    parts: list[Any] = [int(s) if s.isdecimal() else s for s in path.split("/")]
+    *steps, last = parts
     for step in steps:
         document = document[step] if isinstance(document, list) else document.setdefault(step, {})
     if value is _REMOVE:
@@ -278,6 +279,7 @@ def _field_faults() -> Iterator[Fault]:
     for path, where in indices:
         yield _edit(f"{where} out of range", "index_out_of_range", where, (path, 99))
         yield _edit(f"{where} is -1", "index_out_of_range", where, (path, -1))
+    value: Any
     for value, kind in ((True, "true"), (0.0, "a float"), ("0", "a string"), (None, "null"), ([0], "a list")):
         yield _edit(f"a mesh index that is {kind}", "wrong_type", "nodes[0].mesh", ("nodes/0/mesh", value))
     yield _edit("an index of 300 digits", "index_out_of_range", "nodes[0].mesh", ("nodes/0/mesh", 10**300))
@@ -488,7 +490,8 @@ def _data_faults() -> Iterator[Fault]:
     yield _edit("fewer colours than positions", "count_mismatch", f"{attributes}.COLOR_0", ("accessors/2/count", 3))
     custom = ("meshes/0/primitives/0/attributes/_CUSTOM", 3)
     yield _edit("a custom attribute of another count", "count_mismatch", f"{attributes}.'_CUSTOM'", custom)
-    for name, accessor, edits in (
+    wrong: tuple[tuple[str, Any], ...]
+    for name, accessor, wrong in (
         ("positions of VEC2", "POSITION", (("accessors/0/type", "VEC2"),)),
         ("positions of ushort", "POSITION", (("accessors/0/componentType", 5123),)),
         ("normals of VEC4", "NORMAL", (("accessors/1/type", "VEC4"), ("accessors/1/count", 3), ("accessors/0/count", 3))),
@@ -500,7 +503,7 @@ def _data_faults() -> Iterator[Fault]:
         ("texture coordinates of VEC3", "TEXCOORD_0", (("meshes/0/primitives/0/attributes/TEXCOORD_0", 1),)),
         ("no data for positions", "POSITION", (("accessors/0/bufferView", _REMOVE),)),
     ):
-        yield _edit(name, "bad_accessor", f"{attributes}.{accessor}", *edits)
+        yield _edit(name, "bad_accessor", f"{attributes}.{accessor}", *wrong)
     floats = (("accessors/3/componentType", 5126), ("accessors/3/count", 1))
     yield _edit("indices of byte", "bad_accessor", place, ("accessors/3/componentType", 5120))
     yield _edit("indices of float", "accessor_out_of_view", "accessors[3].count", ("accessors/3/componentType", 5126))

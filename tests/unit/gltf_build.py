@@ -74,4 +74,5 @@ def world_triangles(scene: Scene) -> NDArray[np.float64]:
 def face_normals(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    unit: NDArray[np.float64] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return unit

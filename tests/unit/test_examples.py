@@ -33,7 +33,8 @@ def probes_of(example: Example) -> np.ndarray:
     volume = parse_spec(example[1]).volumes[0]
     assert volume.origin is not None and volume.spacing is not None and volume.counts is not None
     steps = np.stack(np.meshgrid(*(np.arange(n) for n in volume.counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.array(volume.origin) + steps * np.array(volume.spacing)
+    positions: np.ndarray = np.array(volume.origin) + steps * np.array(volume.spacing)
+    return positions
 
 
 @pytest.mark.parametrize("name", ALL)

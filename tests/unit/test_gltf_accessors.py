@@ -69,7 +69,7 @@ def test_interleaved(tmp_path: Path) -> None:
     primitive = {"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": raw.accessor(ORDER, USHORT)}
     scene = raw.load(tmp_path, meshes=[{"primitives": [primitive]}])
     np.testing.assert_array_equal(scene.positions + scene.origin, SQUARE)
-    np.testing.assert_allclose(scene.normals, [[0, 0.6, 0.8], [0, 0, 1], [1, 0, 0], [0, 0, 1]], atol=1e-7)
+    np.testing.assert_allclose(scene.normals, np.array([[0, 0.6, 0.8], [0, 0, 1], [1, 0, 0], [0, 0, 1]]), atol=1e-7)
     np.testing.assert_allclose(scene.colors, [[1, 0, 0.2, 1]] * 4, atol=1e-7)
 
 

@@ -63,7 +63,7 @@ def test_lights(tmp_path: Path) -> None:
     lights = scene.lights
     assert lights.kind.tolist() == [LIGHT_POINT, LIGHT_DIRECTIONAL, LIGHT_SPOT, LIGHT_SPOT]
     np.testing.assert_allclose(lights.position, [[1, 2, 3], [0, 0, 0], [1, 2, 3], [0, 0, 0]])
-    np.testing.assert_allclose(lights.direction, [[0, 0, 0], [0, 0, 1], [0, 0.6, 0.8], [0, 0, -1]], atol=1e-7)
+    np.testing.assert_allclose(lights.direction, np.array([[0, 0, 0], [0, 0, 1], [0, 0.6, 0.8], [0, 0, -1]]), atol=1e-7)
     np.testing.assert_allclose(lights.value, [[3, 3, 3], [4, 2, 1], [0, 2, 0], [1, 1, 1]])
     np.testing.assert_allclose(lights.cos_inner, [1, 1, math.cos(0.25), 1], rtol=1e-6)
     np.testing.assert_allclose(lights.cos_outer, [-1, -1, math.cos(1), math.cos(math.pi / 4)], rtol=1e-6)

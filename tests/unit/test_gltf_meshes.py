@@ -55,14 +55,16 @@ def test_points_and_lines_are_listed_as_ignored(mode: int, tmp_path: Path) -> No
     assert raw.load(tmp_path, meshes=[{"primitives": primitives[:1]}]).triangle_count == 0
 
 
-def test_unused_vertices_are_left_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("others", [5, 50])
+def test_unused_vertices_are_left_out(others: int, tmp_path: Path) -> None:
     raw = Raw()
-    points = np.concatenate([np.full((5, 3), 1e6), TRIANGLE, np.full((5, 3), -1e6)])
-    attributes = {"POSITION": raw.accessor(points), "COLOR_0": raw.accessor(np.linspace(0, 1, 39).reshape(13, 3))}
+    points = np.concatenate([np.full((5, 3), 1e6), TRIANGLE, np.full((others, 3), -1e6)])
+    colors = np.concatenate([np.linspace(0, 1, 24).reshape(8, 3), np.zeros((others, 3))])
+    attributes = {"POSITION": raw.accessor(points), "COLOR_0": raw.accessor(colors)}
     scene = raw.load(tmp_path, meshes=[{"primitives": [{"attributes": attributes, "indices": raw.accessor([5, 6, 7], UBYTE)}]}])
     assert len(scene.positions) == 3
     assert scene.bounds.tolist() == [[0, 0, 0], [1, 1, 0]]
-    np.testing.assert_allclose(scene.colors[:, 0], np.linspace(0, 1, 39)[15:24:3], atol=1e-7)
+    np.testing.assert_allclose(scene.colors[:, 0], np.linspace(0, 1, 24)[15:24:3], atol=1e-7)
 
 
 def test_primitives_share_vertices_and_keep_their_materials(tmp_path: Path) -> None:
@@ -85,12 +87,14 @@ def test_primitives_share_vertices_and_keep_their_materials(tmp_path: Path) -> N
 def test_normals(tmp_path: Path) -> None:
     """Unit where given, zero where not, and none at all where they say nothing that the triangles do not."""
     w = GlbWriter()
-    smooth = [[0, 0, 5], [0.6, 0, 0.8], [0, 0, 0]]
+    smooth = np.array([[0, 0, 5], [0.6, 0, 0.8], [0, 0, 0]])
     w.node(mesh=w.mesh("m", [Part(TRIANGLE, normals=smooth), Part(TRIANGLE)]))
     scene = load_glb(w.to_glb(), tmp_path)
-    np.testing.assert_allclose(scene.normals, [[0, 0, 1], [0.6, 0, 0.8], [0, 0, 0]] + [[0, 0, 0]] * 3, atol=1e-7)
+    expected = np.zeros((6, 3))
+    expected[:2] = smooth[:2] / [[5], [1]]
+    np.testing.assert_allclose(scene.normals, expected, atol=1e-7)
     w = GlbWriter()
-    w.node(mesh=w.mesh("m", [Part(TRIANGLE, normals=[[0, 0, 2], [5e-5, 0, 1], [0, 0, 1]])]))
+    w.node(mesh=w.mesh("m", [Part(TRIANGLE, normals=np.array([[0, 0, 2], [5e-5, 0, 1], [0, 0, 1]]))]))
     assert load_glb(w.to_glb(), tmp_path).normals.shape == (0, 3)
     # Facing the other way says something.
     w = GlbWriter()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ def rotation(axis: list[float], angle: float) -> np.ndarray:
     """Rodrigues' formula, independent of quaternions."""
     x, y, z = axis
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+    turned: np.ndarray = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+    return turned
 
 
 def test_hierarchy_composes(tmp_path: Path) -> None:
@@ -73,7 +75,8 @@ def test_what_is_outside_the_scene_is_not_refused(tmp_path: Path) -> None:
 
 
 def test_a_scene_without_geometry(tmp_path: Path) -> None:
-    for parts in ({"nodes": [], "scenes": [{}]}, {"nodes": [{"name": "empty"}]}):
+    cases: tuple[dict[str, Any], ...] = ({"nodes": [], "scenes": [{}]}, {"nodes": [{"name": "empty"}]})
+    for parts in cases:
         scene = Raw().load(tmp_path, **parts)
         assert scene.triangle_count == 0 and scene.mesh_first_triangle.tolist() == [0, 0]
         assert scene.bounds.tolist() == [[0, 0, 0], [0, 0, 0]] and scene.origin.tolist() == [0, 0, 0]
