@@ -58,7 +58,7 @@ class Rasterizer:
         self._shadows = depth_target(device, size, size, layers, sampled=True)
         self._views = storage(device, layers * 128)
         self._draws, transforms = _draws(scene)
-        resources = [
+        resources: list[Buffer | Image] = [
             storage(device, scene.positions),
             storage(device, scene.normals),
             storage(device, scene.colors),
@@ -90,9 +90,7 @@ class Rasterizer:
         """
         if not self._draws:
             return _empty(self._environment, width, height)
-        if (width, height) not in self._targets:
-            self._targets[width, height] = _Targets.make(self._device, width, height)
-        targets = self._targets[width, height]
+        targets = self._targets_of(width, height)
         lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
         sums = np.zeros((3, height, width, 4))
         receivers = self._visible(lens, targets)
@@ -107,23 +105,39 @@ class Rasterizer:
         mean = (sums / samples).astype(np.float32)
         return Picture(direct=mean[0, ..., :3], indirect=mean[1, ..., :3], emission=mean[2, ..., :3], hit=mean[2, ..., 3])
 
-    def distances(self, camera: Camera, width: int, height: int) -> F64:
-        """Distance along the camera's axis to what pixel centres see, (height, width) float64 in metres; inf where nothing is."""
+    def glimpse(self, camera: Camera, width: int, height: int) -> tuple[Picture, F64]:
+        """A quick look through pixel centres.
+
+        Returns
+        -------
+        picture : Picture
+            Without direct light.
+        distances : (height, width) float64
+            How far along the camera's axis surfaces are, metres; inf where there is none.
+        """
         if not self._draws:
-            return np.full((height, width), np.inf)
+            return _empty(self._environment, width, height), np.full((height, width), np.inf)
+        targets = self._targets_of(width, height)
+        lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
+        self._draw(lens, targets, (0.0, 0.0), (0, 0))
+        direct, indirect, emission = (b.read(np.float32, (height, width, 4)) for b in targets.download)
+        picture = Picture(direct[..., :3], indirect[..., :3], emission[..., :3], emission[..., 3])
+        return picture, self._distances(lens, targets)
+
+    def _targets_of(self, width: int, height: int) -> _Targets:
         if (width, height) not in self._targets:
             self._targets[width, height] = _Targets.make(self._device, width, height)
-        lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
-        return self._distances(lens, self._targets[width, height])
+        return self._targets[width, height]
 
     def _distances(self, lens: _Lens, targets: _Targets) -> F64:
-        self._draw(lens, targets, (0.0, 0.0), (0, 0))
+        """Distance along the camera's axis to what was last drawn, (height, width) float64 in metres; inf where nothing was."""
         self._device.run(lambda commands: commands.download(targets.depth, targets.download[0]))
         depth = targets.download[0].read(np.float32, (targets.depth.height, targets.depth.width)).astype(np.float64)
         return np.divide(lens.near, depth, out=np.full_like(depth, np.inf), where=depth > 0)
 
     def _visible(self, lens: _Lens, targets: _Targets) -> F64:
         """Points on what the picture shows, for shadow maps to be fitted to; the scene's corners where it shows nothing."""
+        self._draw(lens, targets, (0.0, 0.0), (0, 0))
         distances = self._distances(lens, targets)
         rows, columns = np.nonzero(np.isfinite(distances))
         if not rows.size:
@@ -145,10 +159,10 @@ class Rasterizer:
 
     def _draw(self, lens: _Lens, targets: _Targets, shift: tuple[float, float], lights: tuple[int, int]) -> None:
         push = _push(lens.projection(*shift), [*lens.eye, self._flags], lights)
-        nothing, background = (0.0, 0.0, 0.0, 0.0), (*(float(x) for x in self._environment), 0.0)
+        r, g, b = (float(x) for x in self._environment)
 
         def record(commands: Commands) -> None:
-            clear = [nothing, nothing, background]
+            clear = [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (r, g, b, 0.0)]
             commands.draw(self._program, self._draws, push, colors=targets.colors, depth=targets.depth, clear=clear)
             for image, buffer in zip(targets.colors, targets.download, strict=True):
                 commands.download(image, buffer)
@@ -183,7 +197,7 @@ class _Targets:
 
 @dataclass(frozen=True)
 class _Lens:
-    """A camera in the local frame. `axes` holds right, up and back as rows; `tangents` half the picture's width and height at distance 1."""
+    """A camera in the local frame: `axes` are right, up and back as rows, `tangents` half the picture's width and height at distance 1."""
 
     eye: F64
     axes: F64

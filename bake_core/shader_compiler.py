@@ -5,16 +5,9 @@ from __future__ import annotations
 import subprocess
 from typing import Literal
 
+from bake_core.bundle import SHADERS
 from bake_core.errors import BakeError, MachineError
 from bake_core.shader_files import shader_dir
-
-# In the order in which a host includes them; constants.glsl (generated) goes between grid.glsl and irradiance.glsl.
-MODULE = ("octahedral.glsl", "grid.glsl", "irradiance.glsl")
-
-
-def module_files() -> dict[str, str]:
-    """The module's files as a bundle ships them: file name to text, README.md included, constants.glsl (generated) not."""
-    return {name: shader_text(name) for name in (*MODULE, "README.md")}
 
 
 def module_source(constants: str) -> str:
@@ -25,7 +18,7 @@ def module_source(constants: str) -> str:
     constants : str
         A bundle's constants.glsl.
     """
-    octahedral, grid, irradiance = (shader_text(name) for name in MODULE)
+    octahedral, grid, irradiance = (shader_text(name) for name in SHADERS)
     return "\n".join((octahedral, grid, constants, irradiance))
 
 
