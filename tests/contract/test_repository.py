@@ -142,6 +142,14 @@ def test_every_page_of_the_documentation_is_linked_from_its_index() -> None:
             assert f"({page.relative_to(ROOT / 'docs').as_posix()})" in index, f"docs/README.md does not link {page.name}"
 
 
+@pytest.mark.parametrize("package", ["bake_core", "service"])
+def test_the_architecture_page_places_every_module(package: str) -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    for path in (ROOT / package).iterdir():
+        if path.name[0] != "_" and (path.suffix == ".py" or (path / "__init__.py").exists()):
+            assert re.search(rf"\b{path.stem}\b", page), f"{package}.{path.stem} has no place in docs/architecture.md"
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in tracked():
         if page.suffix == ".md":
