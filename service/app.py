@@ -11,8 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 
 import bake_core
 from bake_core.spec import Spec
-from service import problems
-from service.documents import Problem
+from service import documents, problems
 from service.parts import Service
 from service.routes import bakes, blobs, health, pages, scenes, verifications
 from service.routes.health import Requests
@@ -20,6 +19,7 @@ from service.routes.health import Requests
 DESCRIPTION = """Server-side global-illumination baking: a glTF scene and a grid of light probes go in, octahedral atlases with a
 measured error come out. Upload (`PUT /v1/blobs`, `POST /v1/scenes`), bake (`POST /v1/bakes`), follow (`/events`), fetch (`/bundle`).
 Errors are RFC 9457 problems with a stable `slug`."""
+REFERENCE = "#/components/schemas/{model}"
 
 
 def create_app(service: Service) -> FastAPI:
@@ -49,23 +49,38 @@ def describe() -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
     )
-    problems.install(app)
-    for module in (blobs, scenes, bakes, verifications, health, pages):
-        app.include_router(module.router)
+    routers = [module.router for module in (blobs, scenes, bakes, verifications, health, pages)]
+    for router in routers:
+        app.include_router(router)
+    problems.install(app, routers)
     app.add_middleware(Requests)
     framework_openapi = app.openapi
 
     def openapi() -> dict[str, Any]:
-        document = framework_openapi()
-        schemas = document["components"]["schemas"]
-        if "Spec" not in schemas:
-            spec = Spec.model_json_schema(ref_template="#/components/schemas/{model}")
-            schemas.update(spec.pop("$defs"))
-            schemas["Spec"] = spec
-            schemas["Problem"] = Problem.model_json_schema()
-            for unused in ("HTTPValidationError", "ValidationError"):
-                schemas.pop(unused, None)
-        return document
+        if app.openapi_schema is None:
+            _complete(framework_openapi())
+        assert app.openapi_schema is not None
+        return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]  # the framework's documented way to extend it
     return app
+
+
+def _complete(document: dict[str, Any]) -> None:
+    """Add what the framework cannot know to its OpenAPI document: the spec's own schema, and that errors are problems."""
+    schemas = document["components"]["schemas"]
+    spec = Spec.model_json_schema(ref_template=REFERENCE)
+    schemas |= spec.pop("$defs")
+    schemas |= {"Spec": spec} | {m.__name__: m.model_json_schema() for m in (documents.Problem, documents.SceneRequest)}
+    for model in schemas.values():
+        for name, value in model.get("properties", {}).items():
+            if value.pop(documents.SPEC_MARK, False):
+                described = {"description": value["description"]} if "description" in value else {}
+                model["properties"][name] = {"$ref": REFERENCE.format(model="Spec"), **described}
+    # The framework says 422 of everything that takes a parameter; where a route can answer it, the route says so itself.
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            if "HTTPValidationError" in str(operation["responses"].get("422")):
+                del operation["responses"]["422"]

@@ -202,6 +202,11 @@ Item = TypeVar("Item")
 class Page(BaseModel, Generic[Item]):
     """A page of a list, the newest first."""
 
+    @classmethod
+    def model_parametrized_name(cls, params: tuple[Any, ...]) -> str:
+        """BakePage rather than Page[Bake], so that clients' generated types have decent names."""
+        return f"{params[0].__name__}Page"
+
     items: list[Item]
     next: str | None = Field(description="`cursor` of the next page; null on the last.")
 

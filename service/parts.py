@@ -39,6 +39,8 @@ class Service:
 
     def close(self) -> None:
         """Stop the work, leave it to be resumed, and let go of the data folder."""
-        self.scheduler.close()
-        self.store.close()
-        self._lock.close()
+        try:
+            self.scheduler.close()
+        finally:
+            self.store.close()
+            self._lock.close()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from fastapi.routing import APIRoute, APIRouter
 from starlette.exceptions import HTTPException
 
 from bake_core.errors import InputError, OctobakeError
@@ -54,8 +55,8 @@ def problem(status: int, slug: str, detail: str, where: str = "", headers: Mappi
     return JSONResponse(document, status, headers=dict(headers or {}), media_type=MEDIA_TYPE)
 
 
-def install(app: FastAPI) -> None:
-    """Give `app` an answer of this form to every exception."""
+def install(app: FastAPI, routers: Sequence[APIRouter]) -> None:
+    """Give `app`, whose routes are those of `routers`, an answer of this form to every exception."""
 
     async def ours(_: Request, error: Exception) -> Response:
         assert isinstance(error, OctobakeError)
@@ -63,10 +64,16 @@ def install(app: FastAPI) -> None:
             log.error("%s: %s", error.slug, error)
         return problem(error.http_status, error.slug, error.message, error.where, getattr(error, "headers", None))
 
-    async def framework(_: Request, error: Exception) -> Response:
+    async def framework(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         slug, detail = FRAMEWORK_SLUGS.get(error.status_code, ("request.refused", str(error.detail)))
-        return problem(error.status_code, slug, detail, headers=error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405:
+            # The framework names the methods of the first route of this path only.
+            routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
+            methods = {m for route in routes if route.path_regex.match(request.url.path) for m in route.methods or ()}
+            headers["Allow"] = ", ".join(sorted(methods))
+        return problem(error.status_code, slug, detail, headers=headers)
 
     async def validation(_: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)

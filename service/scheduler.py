@@ -70,7 +70,8 @@ class Scheduler:
             thread.join(STOP_SECONDS)
         if self._compute:
             self._compute.close()
-        self._thread.join(STOP_SECONDS)
+        if self._thread.is_alive():
+            self._thread.join(STOP_SECONDS)
 
     def _loop(self) -> None:
         while not self._stopping:
@@ -78,7 +79,9 @@ class Scheduler:
                 self._compute = Compute(self._settings, self._hear)
                 break
             except Exception as e:
-                log.error("%s; trying again", e)
+                # A shutdown during the start takes the cluster away from under it.
+                if not self._stopping:
+                    log.error("%s; trying again", e)
                 self._sleep(RETRY_SECONDS)
         while not self._stopping:
             try:

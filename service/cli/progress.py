@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from typing import TextIO
+from collections.abc import Mapping
+from typing import Any, TextIO
 
 from bake_core.progress import Progress
 
@@ -78,9 +79,32 @@ def describe(progress: Progress) -> str:
     return ", ".join(parts)
 
 
+def describe_result(result: Mapping[str, Any]) -> str:
+    """What came of a bake: ``64 samples, error 1.3 %, 6.2 s, stopped at its target``."""
+    reasons = {"target": "stopped at its target", "samples": "stopped at its samples", "time": "stopped at its time"}
+    error = "error unknown" if result["error"] is None else f"error {percent(result['error'])}"
+    return f"{result['samples']} samples, {error}, {duration(result['seconds'])}, {reasons[result['stopped']]}"
+
+
+def describe_job(job: Mapping[str, Any]) -> str:
+    """One line about a bake from the service's JSON."""
+    told = job["progress"]
+    if job["error"]:
+        place = f"{job['error']['where']}: " if job["error"]["where"] else ""
+        text = f"[{job['error']['slug']}] {place}{job['error']['message']}"
+    elif job["result"]:
+        text = describe_result(job["result"])
+    elif told:
+        text = describe(Progress(told["stage"], told["fraction"], told["samples"], told["error"], told["seconds"], told["eta"]))
+    else:
+        text = f"priority {job['priority']}"
+    labels = "".join(f" {key}={value}" for key, value in job["labels"].items())
+    return f"{job['id']}  {job['state']:<10}  {job['created'][:19]}  {text}{labels}"
+
+
 def percent(error: float) -> str:
     """An error as a percentage with two significant digits, since its own uncertainty is of that order."""
-    return f"{error * 100:.2g} %"
+    return f"{error * 100:.2g} %" if error < 1 else f"{error * 100:.0f} %"
 
 
 def duration(seconds: float) -> str:

@@ -76,7 +76,11 @@ def run(args: argparse.Namespace) -> int:
         finally:
             if args.ready_file:
                 args.ready_file.unlink(missing_ok=True)
-    return 0
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Everything is stored and closed. Dask's exit hooks would wait ten seconds for a worker that is busy compiling, and taking numba
+    # apart takes another: go now, and what is left of the worker goes with us.
+    os._exit(0)
 
 
 def _write_whole(path: Path, text: str) -> None:

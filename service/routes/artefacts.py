@@ -11,6 +11,10 @@ from fastapi.responses import Response, StreamingResponse
 from service.blobs import Blobs
 from service.problems import RequestError
 
+# What GET and HEAD take, for the OpenAPI document.
+_CONDITIONS = ("If-Match", "If-None-Match")
+HEAD_HEADERS = {"parameters": [{"in": "header", "name": name, "schema": {"type": "string"}} for name in _CONDITIONS]}
+GET_HEADERS = {"parameters": [{"in": "header", "name": name, "schema": {"type": "string"}} for name in (*_CONDITIONS, "Range", "If-Range")]}
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)\Z")
 _TAG = re.compile(r'(W/)?("[^"]*")')
 

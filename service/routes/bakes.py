@@ -10,7 +10,7 @@ from service import documents
 from service.jobs import Job, Kind, State
 from service.parts import Service
 from service.problems import RequestError
-from service.routes.artefacts import artefact
+from service.routes.artefacts import GET_HEADERS, HEAD_HEADERS, artefact
 from service.routes.bodies import JsonRoute
 from service.routes.common import Here, failures
 from service.routes.jobs import accepted, add_job_routes, find, not_there
@@ -48,9 +48,9 @@ def create_bake(body: documents.BakeRequest, service: Here, response: Response) 
 add_job_routes(router, Kind.BAKE, documents.Bake, _document)
 
 
-@router.api_route(
+@router.get(
     "/{id}/bundle",
-    methods=["GET"],
+    openapi_extra=GET_HEADERS,
     operation_id="getBundle",
     summary="Download a bake's bundle",
     response_class=Response,
@@ -61,7 +61,14 @@ add_job_routes(router, Kind.BAKE, documents.Bake, _document)
         **failures(404, 409, 412, 416),
     },
 )
-@router.head("/{id}/bundle", operation_id="headBundle", summary="Size and digest of a bake's bundle", responses=failures(404, 409))
+@router.head(
+    "/{id}/bundle",
+    openapi_extra=HEAD_HEADERS,
+    operation_id="headBundle",
+    summary="Size and digest of a bake's bundle",
+    response_class=Response,
+    responses=failures(404, 409, 412),
+)
 def get_bundle(id: str, request: Request, service: Here) -> Response:
     """Answer the bundle, whole or a range of it; `ETag` and `Repr-Digest` are its sha256."""
     return _file(service, request, id, "bundle", "application/zip", "zip")
@@ -69,10 +76,11 @@ def get_bundle(id: str, request: Request, service: Here) -> Response:
 
 @router.get(
     "/{id}/report",
+    openapi_extra=GET_HEADERS,
     operation_id="getReport",
     summary="A bake's report",
     response_class=Response,
-    responses={200: {"description": "report.json.", "content": {"application/json": {}}}, **failures(404, 409)},
+    responses={200: {"description": "report.json.", "content": {"application/json": {}}}, **failures(404, 409, 412, 416)},
 )
 def get_report(id: str, request: Request, service: Here) -> Response:
     """Answer report.json: what was done, how long it took, and the error against time."""

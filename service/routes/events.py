@@ -44,15 +44,17 @@ async def _follow(service: Service, job: str, last: int) -> AsyncIterator[Server
         while True:
             news.event.clear()
             if news.rows:
+                # Lowered before the store is asked: what is rung in the meantime is asked for again.
+                news.rows = False
                 events = await run_in_threadpool(service.store.events, job, last, PAGE)
-                news.rows = len(events) == PAGE
                 for event in events:
                     last = event.id
                     data = {"at": datetime.fromtimestamp(event.at, UTC).isoformat(), **event.data}
                     yield ServerSentEvent(json.dumps(data), event=event.type, id=str(event.id))
                     if event.type == "state" and State(event.data["state"]) in FINISHED:
                         return
-                if news.rows:
+                if len(events) == PAGE:
+                    news.rows = True
                     continue
             progress = service.hub.progress(job)
             if progress is not None and progress != shown:

@@ -121,6 +121,7 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
         operation_id=f"follow{name}",
         summary=f"Follow a {noun}",
         description="Server-sent events; those with an id are replayed after `Last-Event-ID`. The stream ends when the job has finished.",
+        openapi_extra={"parameters": [{"in": "header", "name": "Last-Event-ID", "schema": {"type": "integer"}}]},
         responses={**sse, **failures(400, 404)},
         response_class=Response,
     )

@@ -39,7 +39,7 @@ router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
             "required": True,
             "content": {
                 "model/gltf-binary": {"schema": {"type": "string", "format": "binary"}},
-                "application/json": {"schema": documents.SceneRequest.model_json_schema()},
+                "application/json": {"schema": {"$ref": "#/components/schemas/SceneRequest"}},
             },
         }
     },

@@ -8,7 +8,7 @@ from service import documents
 from service.jobs import Job, Kind, State
 from service.parts import Service
 from service.problems import RequestError
-from service.routes.artefacts import artefact
+from service.routes.artefacts import GET_HEADERS, HEAD_HEADERS, artefact
 from service.routes.bodies import JsonRoute
 from service.routes.common import Here, failures, unknown
 from service.routes.jobs import accepted, add_job_routes, find, not_there
@@ -46,6 +46,7 @@ add_job_routes(router, Kind.VERIFICATION, documents.Verification, _document)
 
 @router.get(
     "/{id}/files/{name:path}",
+    openapi_extra=GET_HEADERS,
     operation_id="getVerificationFile",
     summary="A picture or a report of a verification",
     response_class=Response,
@@ -54,7 +55,14 @@ add_job_routes(router, Kind.VERIFICATION, documents.Verification, _document)
         **failures(404, 409, 412, 416),
     },
 )
-@router.head("/{id}/files/{name:path}", operation_id="headVerificationFile", summary="Size and digest of such a file")
+@router.head(
+    "/{id}/files/{name:path}",
+    openapi_extra=HEAD_HEADERS,
+    operation_id="headVerificationFile",
+    summary="Size and digest of such a file",
+    response_class=Response,
+    responses=failures(404, 409, 412),
+)
 def get_file(id: str, name: str, request: Request, service: Here) -> Response:
     """Answer one of the files that the result lists."""
     job = find(service, Kind.VERIFICATION, id)

@@ -42,7 +42,10 @@ class Client:
         self, base_url: str, *, timeout: float = 60.0, patience: float = 30.0, transport: httpx.BaseTransport | None = None
     ) -> None:
         self.patience = patience
-        self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers={"User-Agent": "octobake-client"})
+        try:
+            self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers={"User-Agent": "octobake-client"})
+        except httpx.InvalidURL as e:
+            raise OctobakeClientError("client.bad_url", f"is not a URL: {e}", base_url) from None
 
     def __enter__(self) -> Self:
         return self
