@@ -1,0 +1,93 @@
+"""Small scenes and cameras for tests of transport: made by our own writer, read by our own reader."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bake_core.gltf.reader import load_scene
+from bake_core.gltf.writer import GlbWriter, Part, look_at
+from bake_core.scene import Camera, Scene
+from bake_core.spec import parse_spec
+from bake_core.transport import Tracer
+
+Array = NDArray[Any]
+
+QUAD = np.array([[0, 1, 2], [0, 2, 3]])
+# A unit square in the plane y = 0 about zero, facing up.
+SQUARE = np.array([[-0.5, 0, -0.5], [-0.5, 0, 0.5], [0.5, 0, 0.5], [0.5, 0, -0.5]])
+ONE_PROBE = {"name": "one", "origin": [0.0, 0.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
+
+
+def load(writer: GlbWriter) -> Scene:
+    """What the reader makes of what the writer wrote."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.glb"
+        path.write_bytes(writer.to_glb())
+        return load_scene(path)
+
+
+def build(scene: Scene | GlbWriter, **spec: Any) -> Tracer:
+    """A tracer, with some of the spec's keys given."""
+    scene = load(scene) if isinstance(scene, GlbWriter) else scene
+    return Tracer.build(scene, parse_spec({"volumes": [ONE_PROBE], **spec}))
+
+
+def sky(radiance: float = 1.0) -> dict[str, Any]:
+    return {"kind": "constant", "radiance": [radiance] * 3}
+
+
+def add_square(
+    writer: GlbWriter,
+    name: str = "square",
+    color: Sequence[float] = (0.5, 0.5, 0.5),
+    *,
+    matrix: ArrayLike | None = None,
+    vertex_colors: ArrayLike | None = None,
+    **material: Any,
+) -> int:
+    """A unit square in the plane y = 0, facing up; keywords are the material's."""
+    part = Part(SQUARE, QUAD, colors=vertex_colors, material=writer.material(name, color, **material))
+    return writer.node(name, mesh=writer.mesh(name, [part]), matrix=matrix)
+
+
+def square_scene(**material: Any) -> Scene:
+    w = GlbWriter()
+    add_square(w, **material)
+    return load(w)
+
+
+def icosphere(subdivisions: int) -> tuple[Array, Array]:
+    """Vertices on the unit sphere and triangles that face outwards."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+
+
+def camera_at(eye: Sequence[float], target: Sequence[float], *, width: float) -> Camera:
+    """A camera whose square picture spans `width` metres at the target."""
+    distance = math.dist(eye, target)
+    return Camera("test", look_at(eye, target), 2 * math.atan(width / 2 / distance))
+
+
+def polygon_irradiance(corners: ArrayLike, point: ArrayLike, normal: ArrayLike) -> float:
+    """Irradiance at a point from a polygon of radiance 1 that lies wholly above its horizon.
+
+    Lambert 1760, "Photometria": E = ½ Σ θ_i n·Γ_i over the polygon's edges, θ the angle that an edge spans and Γ the unit normal of
+    its plane. Positive whichever way the corners run.
+    """
+    v = np.asarray(corners, np.float64) - np.asarray(point, np.float64)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    total = 0.0
+    for a, b in zip(v, np.roll(v, -1, 0), strict=True):
+        plane = np.cross(a, b)
+        sine = float(np.linalg.norm(plane))
+        total += math.atan2(sine, float(a @ b)) * float(plane @ np.asarray(normal, np.float64)) / sine
+    return abs(total) / 2
