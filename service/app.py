@@ -10,7 +10,9 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 import bake_core
+from bake_core.cameras import GivenCamera
 from bake_core.spec import Spec
+from bake_core.thresholds import Thresholds
 from service import documents, problems
 from service.parts import Service
 from service.routes import bakes, blobs, health, pages, scenes, verifications
@@ -67,16 +69,12 @@ def describe() -> FastAPI:
 
 
 def _complete(document: dict[str, Any]) -> None:
-    """Add what the framework cannot know to its OpenAPI document: the spec's own schema, and that errors are problems."""
+    """Add what the framework cannot know to its OpenAPI document: the core's own schemas, and that errors are problems."""
     schemas = document["components"]["schemas"]
-    spec = Spec.model_json_schema(ref_template=REFERENCE)
-    schemas |= spec.pop("$defs")
-    schemas |= {"Spec": spec} | {m.__name__: m.model_json_schema() for m in (documents.Problem, documents.SceneRequest)}
-    for model in schemas.values():
-        for name, value in model.get("properties", {}).items():
-            if value.pop(documents.SPEC_MARK, False):
-                described = {"description": value["description"]} if "description" in value else {}
-                model["properties"][name] = {"$ref": REFERENCE.format(model="Spec"), **described}
+    for model in (Spec, GivenCamera, Thresholds, documents.Problem, documents.SceneRequest):
+        schema = model.model_json_schema(ref_template=REFERENCE)
+        schemas |= schema.pop("$defs", {}) | {model.__name__: schema}
+    _replace_marks(schemas)
     # The framework says 422 of everything that takes a parameter; where a route can answer it, the route says so itself.
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
@@ -84,3 +82,16 @@ def _complete(document: dict[str, Any]) -> None:
         for operation in operations.values():
             if "HTTPValidationError" in str(operation["responses"].get("422")):
                 del operation["responses"]["422"]
+
+
+def _replace_marks(value: Any) -> None:
+    """Put references where documents.MARK names a model, however deep."""
+    if isinstance(value, dict):
+        if model := value.pop(documents.MARK, None):
+            del value["type"]
+            value["$ref"] = REFERENCE.format(model=model)
+        for part in value.values():
+            _replace_marks(part)
+    elif isinstance(value, list):
+        for part in value:
+            _replace_marks(part)

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
+from bake_core.verification import HEIGHT, LARGEST_SIDE, MOST_SAMPLES, SAMPLES, WIDTH
 from service.jobs import Job, State
 
 Digest = Annotated[
@@ -19,11 +20,17 @@ Labels = Annotated[
     Field(max_length=32, description="For your own use; lists can be filtered by them.", examples=[{"level": "rooms"}]),
 ]
 Priority = Annotated[int, Field(ge=-1000, le=1000, description="Higher goes first; equals go in order of arrival.")]
-# The spec has its own parser, whose errors name its fields; the framework only needs to know that it is an object.
-# Its place in the OpenAPI document is taken by the spec's own schema: see service.app.
-SPEC_MARK = "x-octobake-spec"
-SpecDocument = Annotated[dict[str, Any], WithJsonSchema({"type": "object", SPEC_MARK: True})]
+# These have parsers of their own in the core, whose errors name their fields; the framework only needs to know that they are objects.
+# In the OpenAPI document their own schemas take the place of the mark: see service.app.
+MARK = "x-octobake-model"
+SpecDocument = Annotated[dict[str, Any], WithJsonSchema({"type": "object", MARK: "Spec"})]
+CameraDocument = Annotated[dict[str, Any], WithJsonSchema({"type": "object", MARK: "GivenCamera"})]
+ThresholdsDocument = Annotated[dict[str, Any], WithJsonSchema({"type": "object", MARK: "Thresholds"})]
 Time = Annotated[datetime, Field(description="UTC.")]
+
+
+# Of a picture, in pixels: what `octobake verify` takes, too.
+SMALLEST_SIDE = 16
 
 
 class _Request(BaseModel):
@@ -166,9 +173,16 @@ class Bake(_Job):
 class VerificationRequest(_Request):
     """A verification of a finished bake: rendered with its bundle, compared with a path-traced twin."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"bake": "9f86d081884c7d65", "width": 320, "height": 240}]})
+    model_config = ConfigDict(json_schema_extra={"examples": [{"bake": "9f86d081884c7d65", "width": 320, "height": 180, "samples": 64}]})
 
     bake: str = Field(description="Id of a bake that has succeeded.")
+    cameras: Annotated[list[CameraDocument], Field(max_length=64)] | None = Field(
+        None, description="Default: the scene's own, else automatic ones inside it."
+    )
+    thresholds: ThresholdsDocument | None = Field(None, description="Default: those of a Cornell box seen from inside.")
+    width: int = Field(WIDTH, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
+    height: int = Field(HEIGHT, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
+    samples: int = Field(SAMPLES, ge=2, le=MOST_SAMPLES, multiple_of=2, description="Paths a pixel of the path-traced twin.")
     labels: Labels = {}
     priority: Priority = 0
 
@@ -184,7 +198,7 @@ class VerificationResult(BaseModel):
     """What came of a verification."""
 
     passed: bool
-    report: dict[str, Any] = Field(description="The figures; the same as report.json among the files.")
+    report: dict[str, Any] = Field(description="The figures; the same as verification.json among the files.")
     files: dict[str, StoredFile]
     exit_code: int = Field(description="0; or 5: a threshold failed.")
 

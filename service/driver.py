@@ -122,12 +122,8 @@ class Driver:
         self._hub.tell(self.job.id)
 
     def _bake(self) -> None:
-        request = self.job.request
-        spec = parse_spec(request["spec"])
-        scene = self._store.scene(request["scene"])
-        assert scene is not None, "a bake is accepted only for a scene that is here, and none is ever removed"
-        files = {key: scene[key] for key in ("root", "files")}
-        work = worker.Work(self.job.id, self._blobs.url, files, request["spec"], self._settings.threads, self._settings.cached_scenes)
+        spec = parse_spec(self.job.request["spec"])
+        work = self._work(self.job)
         passes = self._store.passes(self.job.id)
         merged = [p for p in passes if p.state is not None]
         opened = passes[len(merged) :]
@@ -210,7 +206,27 @@ class Driver:
         return done
 
     def _verify(self) -> None:
-        raise BakeError("verification.unavailable", "verifications are not built in yet")
+        request = self.job.request
+        baked = self._store.job(request["bake"])
+        assert baked is not None and baked.result is not None, "a verification is accepted only of a bake that has succeeded"
+        work = self._work(baked)
+        self._move(State.RUNNING)
+        made = self._one(worker.verify, work, baked.result["bundle"], request)
+        self._move(State.FINALIZING)
+        for digest, size in made["files"].values():
+            self._store.add_blob(digest, size)
+        report = made["report"]
+        files = {name: {"digest": digest, "bytes": size} for name, (digest, size) in made["files"].items()}
+        result = {"passed": report["passed"], "report": report, "files": files, "exit_code": 0 if report["passed"] else 5}
+        last = Progress("writing", 1.0, request["samples"], None, self._seconds(), 0.0)
+        self._move(State.SUCCEEDED, result=result, progress=asdict(last))
+
+    def _work(self, baked: Job) -> worker.Work:
+        """What a worker is told of a bake's scene and spec."""
+        scene = self._store.scene(baked.request["scene"])
+        assert scene is not None, "a bake is accepted only for a scene that is here, and none is ever removed"
+        files = {key: scene[key] for key in ("root", "files")}
+        return worker.Work(self.job.id, self._blobs.url, files, baked.request["spec"], self._settings.threads, self._settings.cached_scenes)
 
     # Pieces of work
 
@@ -248,6 +264,8 @@ class Driver:
                     advance(max(0.0, 1.0 - piece.told))
             elif news["key"] in running:
                 begun[news["key"]] = news["address"]
+                if "progress" in news:
+                    self._show(Progress(**news["progress"]))
                 if "done" in news:
                     piece = running[news["key"]][0]
                     # A piece that is run again has told a part of this already.

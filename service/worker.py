@@ -15,7 +15,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,13 @@ from dask.typing import Key
 from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
-from bake_core import bake
+from bake_core import bake, verification
+from bake_core.bundle import read_bundle
+from bake_core.cameras import parse_cameras
+from bake_core.progress import Progress
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
+from bake_core.thresholds import parse_thresholds
 from service.blobs import Blobs
 from service.scenes import load_stored
 
@@ -102,6 +106,28 @@ def finish(work: Work, state: str, run: bake.Run) -> dict[str, Any]:
         return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report)}
 
 
+def verify(work: Work, bundle: str, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Render with a bundle and path-traced, and compare; answers the report, and the digests and sizes of all files."""
+    with _task() as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+        blobs = _blobs(work.store)
+        out = Path(folder) / "verification"
+        report = verification.verify(
+            read_bundle(blobs.local_path(bundle)),
+            load_stored(blobs, work.scene),
+            parse_cameras(request["cameras"]) if "cameras" in request else None,
+            out,
+            width=request["width"],
+            height=request["height"],
+            samples=request["samples"],
+            threads=work.own_threads,
+            thresholds=parse_thresholds(request["thresholds"]) if "thresholds" in request else None,
+            progress=task.report,
+            cancelled=task.flag,
+        )
+        paths = sorted(p for p in out.rglob("*") if p.is_file())
+        return {"report": report, "files": {p.relative_to(out).as_posix(): blobs.put_blob(p) for p in paths}}
+
+
 class CancelFlags(WorkerPlugin):
     """One flag per running task, raised as soon as Dask wants the task stopped.
 
@@ -144,6 +170,15 @@ class _Task:
                 return
             self._told_at, done = now, self._done
         self.tell(done=done)
+
+    def report(self, progress: Progress) -> None:
+        """Progress of a task that is the whole of its job; told now and then."""
+        with self._lock:
+            now = time.monotonic()
+            if now - self._told_at < REPORT_INTERVAL:
+                return
+            self._told_at = now
+        self.tell(progress=asdict(progress))
 
     def tell(self, **message: Any) -> None:
         """Send a message to the service."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
+from bake_core.cameras import parse_cameras
+from bake_core.thresholds import parse_thresholds
 from service import documents
 from service.jobs import Job, Kind, State
 from service.parts import Service
@@ -35,6 +37,10 @@ def create_verification(body: documents.VerificationRequest, service: Here, resp
         raise RequestError("bake.unknown", f"there is no bake {body.bake}", "body.bake", 422)
     if bake.state != State.SUCCEEDED:
         raise RequestError("bake.no_bundle", f"the bake is {bake.state}; only one that has succeeded can be verified", "body.bake", 422)
+    if body.cameras is not None:
+        parse_cameras(body.cameras, "body.cameras")
+    if body.thresholds is not None:
+        parse_thresholds(body.thresholds, "body.thresholds")
     request = body.model_dump(exclude={"labels", "priority"}, exclude_none=True)
     job = service.store.add_job(Kind.VERIFICATION, request, body.labels, body.priority)
     accepted(service, response, job, PATH)

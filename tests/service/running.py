@@ -22,7 +22,7 @@ from bake_core.examples import closed_box
 
 ROOT = Path(__file__).resolve().parents[2]
 # The command as it is installed, from this checkout.
-OCTOBAKE = [sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())"]
+OCTOBAKE = [sys.executable, "-m", "service.cli"]
 START_SECONDS = 60.0
 BOX, BOX_SPEC = closed_box(0.5, 1.0)
 
