@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ _WIDTH, _HEIGHT = 48, 27
 _VERTEX_BUDGET = 30_000_000
 _MOST_PLACES, _FEWEST_PLACES, _TURNS = 24, 4, 8
 # Looking a little down, as people do: floors show more of a room's light than ceilings.
-_PITCH = math.radians(-8)
+_PITCH = math.radians(-12)
 
 
 @dataclass(frozen=True)
@@ -37,34 +37,41 @@ class _View:
 def automatic_cameras(rasterizer: Rasterizer, scene: Scene, volumes: Sequence[VolumeData]) -> tuple[Camera, ...]:
     """Three cameras at probes' places, or fewer where fewer see anything.
 
-    From places spread over the active probes, eight horizontal directions each are looked at; those that show much lit, varied
-    surface at a distance win, each next one for being unlike those before it.
+    From places spread over the active probes, glimpses are taken in eight directions about the vertical and towards the middle of all
+    places. Those that show much lit, varied surface at a distance win, each next one for being unlike those before it.
     """
     places = _places(volumes, _how_many(scene))
-    near = min(float(v.spacing.min()) for v in volumes) / 2
+    low, high = places.min(0), places.max(0)
+    reach = float(np.linalg.norm(high - low)) or float(max(v.spacing.max() for v in volumes))
     views = []
     for position in places:
-        for turn in range(_TURNS):
-            angle = 2 * math.pi * turn / _TURNS
-            towards = np.array([math.sin(angle) * math.cos(_PITCH), math.sin(_PITCH), -math.cos(angle) * math.cos(_PITCH)])
+        for towards in _directions(position, (low + high) / 2):
             camera = Camera("", looking(position, position + towards), DEFAULT_YFOV)
             picture, distances = rasterizer.glimpse(camera, _WIDTH, _HEIGHT)
-            views.append(_View(position, towards, _score((picture.indirect + picture.emission) @ LUMINANCE, distances, near)))
+            views.append(_View(position, towards, _score((picture.indirect + picture.emission) @ LUMINANCE, distances, reach)))
     chosen: list[_View] = []
-    reach = float(np.linalg.norm(np.ptp(places, axis=0))) or near
     while len(chosen) < COUNT:
         scores = [v.score * math.prod(1 - 0.9 * _alike(v, c, reach) for c in chosen) for v in views]
         best = int(np.argmax(scores))
         if scores[best] <= 0:
             break
         chosen.append(views[best])
-    if not chosen:  # nothing lit anywhere: two ways of seeing that it is dark
-        chosen = [views[0], views[_TURNS // 2]]
+    # Nothing is lit anywhere: two ways of seeing that it is dark.
+    chosen = chosen or [views[0], views[_TURNS // 2]]
     return tuple(Camera(f"auto{i}", looking(v.position, v.position + v.towards), DEFAULT_YFOV) for i, v in enumerate(chosen))
 
 
+def _directions(position: F64, middle: F64) -> Iterator[F64]:
+    """Unit directions worth looking in from a place."""
+    for turn in range(_TURNS):
+        angle = 2 * math.pi * turn / _TURNS
+        yield np.array([math.sin(angle) * math.cos(_PITCH), math.sin(_PITCH), -math.cos(angle) * math.cos(_PITCH)])
+    if (position != middle).any():
+        yield (middle - position) / np.linalg.norm(middle - position)
+
+
 def _how_many(scene: Scene) -> int:
-    affordable = _VERTEX_BUDGET // max(1, 3 * scene.triangle_count * _TURNS)
+    affordable = _VERTEX_BUDGET // max(1, 3 * scene.triangle_count * (_TURNS + 1))
     return min(_MOST_PLACES, max(_FEWEST_PLACES, affordable))
 
 
@@ -88,18 +95,19 @@ def _places(volumes: Sequence[VolumeData], count: int) -> F64:
     return position[chosen]
 
 
-def _score(light: NDArray[np.floating], distances: F64, near: float) -> float:
-    """How much there is to see: surface that is lit, not right in front, and not all alike."""
+def _score(light: NDArray[np.floating], distances: F64, reach: float) -> float:
+    """How much there is to see: surface that is lit, not right in front of the camera, and not all alike."""
     surface = np.isfinite(distances)
     lit = surface & (light > 0)
     if not lit.any():
         return 0.0
-    close = float((surface & (distances < near)).mean())
     levels = np.log2(light[lit])
     spread = np.histogram(levels, bins=12, range=(levels.max() - 6, levels.max()))[0] / levels.size
     entropy = float(-(spread[spread > 0] * np.log2(spread[spread > 0])).sum()) / math.log2(12)
-    depths = float(np.log2(distances[surface]).std())
-    return float(lit.mean()) * (1 - close) ** 2 * (0.25 + entropy) * (0.5 + min(depths, 1.0))
+    # A fifth of the way across counts as near; a third is as good as any distance.
+    near = float((distances[surface] < reach / 5).mean())
+    typical = min(1.0, 3 * float(np.median(distances[surface])) / reach)
+    return float(lit.mean()) * (1 - 0.9 * near) * typical * (0.25 + entropy)
 
 
 def _alike(a: _View, b: _View, reach: float) -> float:

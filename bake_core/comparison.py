@@ -58,23 +58,37 @@ def compare(picture: F32, halves: tuple[F32, F32], surface: NDArray[np.bool_]) -
 
     Notes
     -----
-    relMSE = mean of (a - b₁)(a - b₂) / (b² + (m/10)²) over pixels and channels, b = (b₁ + b₂)/2, m = mean of b. The product of two
-    differences with independent noise has the squared error's mean without the noise's.
+    relMSE = mean of (a - b₁)(a - b₂) / (b² + (m/10)²) over pixels and channels. The product of two differences with independent noise has
+    the squared error's mean without the noise's, as long as what it is divided by knows nothing of that noise: b is the reference's mean
+    over the 24 pixels around, not the pixel's own value, and m its mean over the picture.
     """
     reference = ((halves[0].astype(np.float64) + halves[1]) / 2).astype(np.float32)
     flip = float(flip_map(reference, picture).mean())
     a, b1, b2 = (x[surface].astype(np.float64) for x in (picture, *halves))
     if not a.size:
         return Figures(0.0, 0.0, 1.0, 0.0, 0.0, flip)
-    b = (b1 + b2) / 2
-    mean, reference_mean = float(a.mean()), float(b.mean())
+    mean, reference_mean = float(a.mean()), float(b1.mean() + b2.mean()) / 2
     if reference_mean == 0:
         same = mean == 0
         return Figures(mean, 0.0, 1.0 if same else None, 0.0 if same else None, 0.0, flip)
-    weight = 1 / (b * b + (RELMSE_FLOOR * reference_mean) ** 2)
+    around = _mean_around(reference, surface)[surface]
+    weight = 1 / (around * around + (RELMSE_FLOOR * reference_mean) ** 2)
     relmse = float(((a - b1) * (a - b2) * weight).mean())
     noise = float(((b1 - b2) ** 2 * weight).mean()) / 4
     return Figures(mean, reference_mean, mean / reference_mean, relmse, noise, flip)
+
+
+def _mean_around(image: F32, surface: NDArray[np.bool_]) -> F64:
+    """Mean over the 5 × 5 pixels around each pixel that show a surface, the pixel itself left out; 0 where there are none."""
+    height, width = surface.shape
+    counted = np.concatenate([image * surface[..., None], surface[..., None]], -1).astype(np.float64)
+    padded = np.pad(counted, ((2, 2), (2, 2), (0, 0)))
+    total = -counted
+    for y in range(5):
+        for x in range(5):
+            total += padded[y : y + height, x : x + width]
+    out: F64 = total[..., :-1] / np.maximum(total[..., -1:], 1)
+    return out
 
 
 def flip_map(reference: F32, picture: F32) -> F32:

@@ -137,12 +137,15 @@ class Rasterizer:
 
     def _visible(self, lens: _Lens, targets: _Targets) -> F64:
         """Points on what the picture shows, for shadow maps to be fitted to; the scene's corners where it shows nothing."""
-        self._draw(lens, targets, (0.0, 0.0), (0, 0))
-        distances = self._distances(lens, targets)
-        rows, columns = np.nonzero(np.isfinite(distances))
-        if not rows.size:
-            return corners(self._bounds)
-        return lens.points(columns + 0.5, rows + 0.5, distances[rows, columns])
+        found = []
+        # Opposite corners of the pixels: towards a horizon, half a pixel is a long way.
+        for shift in (-0.5, 0.5):
+            self._draw(lens, targets, (shift, shift), (0, 0))
+            distances = self._distances(lens, targets)
+            rows, columns = np.nonzero(np.isfinite(distances))
+            found.append(lens.points(columns + 0.5 + shift, rows + 0.5 + shift, distances[rows, columns]))
+        points = np.concatenate(found)
+        return points if len(points) else corners(self._bounds)
 
     def _draw_shadows(self, batch: Batch, receivers: F64) -> None:
         if not batch.views:

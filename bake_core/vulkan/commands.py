@@ -103,8 +103,9 @@ class Commands:
         bindings = pipeline.bindings
         vk.vkCmdBindPipeline(self._handle, pipeline.point, pipeline.handle)
         vk.vkCmdBindDescriptorSets(self._handle, pipeline.point, bindings.layout, 0, 1, [bindings.set], 0, None)
-        data = vk.ffi.from_buffer(push)
-        vk.vkCmdPushConstants(self._handle, bindings.layout, vk.VK_SHADER_STAGE_ALL, 0, len(push), data)
+        if push:
+            data = vk.ffi.from_buffer(push)
+            vk.vkCmdPushConstants(self._handle, bindings.layout, vk.VK_SHADER_STAGE_ALL, 0, len(push), data)
 
 
 def _attachment(view: Any, clear: Any) -> Any:

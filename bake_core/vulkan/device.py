@@ -120,6 +120,7 @@ class Device:
         """Create an object that this device destroys in its end."""
         made = self._call(create, self.handle, info, None)
         self._stack.callback(destroy, self.handle, made, None)
+        self.check()
         return made
 
     def later(self, end: Callable[..., Any], *arguments: Any) -> None:
@@ -133,7 +134,6 @@ class Device:
             raise MachineError("vulkan.missing", f"no Vulkan driver can be loaded; {INSTALL}") from None
         except vk.VkError as e:
             raise MachineError("vulkan.failed", f"{function.__name__}: {type(e).__name__}") from None
-        self.check()
         return made
 
     def check(self) -> None:
@@ -150,7 +150,7 @@ class Device:
             raise MachineError("vulkan.validation", first.replace("\n", " ") + (f" (and {more} more)" if more else ""))
 
     def run(self, record: Callable[[Commands], None]) -> None:
-        """Record commands, run them and wait until they are done."""
+        """Record commands, run them and wait until they are done; only then complain, as nothing in use may be destroyed."""
         allocate = vk.VkCommandBufferAllocateInfo(commandPool=self._pool, level=vk.VK_COMMAND_BUFFER_LEVEL_PRIMARY, commandBufferCount=1)
         buffer = vk.vkAllocateCommandBuffers(self.handle, allocate)[0]
         try:
