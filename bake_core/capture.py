@@ -16,12 +16,12 @@ import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
-from bake_core.embree import new_rayhit
+from bake_core.embree import intersect1, new_rayhit, set_ray
 from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
-from bake_core.transport import Tracer, blocked, find_hit, sample_emitter, trace_path
+from bake_core.transport import Tracer, blocked, sample_emitter, surface, trace_path
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -37,6 +37,8 @@ _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
 _CANCELLED, _DONE = 1, 0
+# geomID of a ray that has met nothing.
+_NOTHING = 0xFFFFFFFF
 
 
 @kernel
@@ -151,7 +153,9 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     b += -fold if b >= 0 else fold
                     length = math.sqrt(a * a + b * b + c * c)
                     dx, dy, dz = a / length, b / length, c / length
-                    emitted, direct, indirect, _, emitter_pdf = trace_path(t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False)
+                    emitted, direct, indirect, _, emitter_pdf = trace_path(
+                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False
+                    )
                     red, green, blue = (
                         emitted[0] + direct[0] + indirect[0],
                         emitted[1] + direct[1] + indirect[1],
@@ -189,7 +193,20 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     light_key = mix64(probe_key + uint64(texels * SCRAMBLES + scramble))
                     position = (x0, y0, z0)
                     rounds = (first + (scramble - first) % SCRAMBLES, end)
-                    _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, light_rate, light_key, normals, lanes, irradiance[p, block, scramble])
+                    _sample_emitters(
+                        t,
+                        ray,
+                        ray_bits,
+                        position,
+                        texel,
+                        texels,
+                        rounds,
+                        light_rate,
+                        light_key,
+                        normals,
+                        lanes,
+                        irradiance[p, block, scramble],
+                    )
             if radiance.shape[0]:
                 radiance[p, texel, 0] += total_r
                 radiance[p, texel, 1] += total_g
@@ -206,12 +223,14 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
             return _CANCELLED
         for i in range(directions.shape[0]):
             dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-            hit, s = find_hit(t, ray, ray_bits, positions[p, 0], positions[p, 1], positions[p, 2], dx, dy, dz, False)
-            if hit:
-                x, y, z = s[0][0] - positions[p, 0], s[0][1] - positions[p, 1], s[0][2] - positions[p, 2]
+            set_ray(ray, ray_bits, positions[p, 0], positions[p, 1], positions[p, 2], dx, dy, dz, np.float32(np.inf))
+            intersect1(t.handle, ray.ctypes.data, 0)
+            if ray_bits[18] != _NOTHING:
+                point, n, _, _, material, front = surface(t, ray_bits, ray, dx, dy, dz)
+                x, y, z = point[0] - positions[p, 0], point[1] - positions[p, 1], point[2] - positions[p, 2]
                 distance[p, i] = math.sqrt(x * x + y * y + z * z)
-                normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = s[1][0], s[1][1], s[1][2]
-                back[p, i] = not s[5] and not t.materials.double_sided[s[4]]
+                normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
+                back[p, i] = not front and not t.materials.double_sided[material]
             else:
                 distance[p, i] = np.inf
                 normal[p, i, 0] = normal[p, i, 1] = normal[p, i, 2] = 0

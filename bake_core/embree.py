@@ -33,7 +33,8 @@ INVALID_ID = np.uint32(0xFFFFFFFF)
 _TRIANGLE, _INSTANCE = 0, 121
 _BUFFER_INDEX, _BUFFER_VERTEX = 0, 1
 _UINT3, _FLOAT3, _FLOAT3X4_ROW_MAJOR = 0x5003, 0x9003, 0x9134
-# Watertight: without it rays slip between triangles that share an edge, about one in ten million, and a sealed room is no longer dark.
+# Watertight. Without it rays slip between triangles that share an edge (28 of 50 million inside a closed box of 49,152 triangles, against
+# none), and a sealed room is no longer dark.
 _SCENE_ROBUST = 1 << 2
 _QUALITY_MEDIUM = 1
 

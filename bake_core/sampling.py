@@ -93,10 +93,10 @@ def sobol_pair(reversed_index, key):  # type: ignore[no-untyped-def]
     (float32, float32) in [0, 1)^2
     """
     h = mix64(key)
-    g = mix64(h)
     i = reverse_bits(scramble_reversed(reversed_index, uint32(h)))
     x = reverse_bits(scramble_reversed(i, uint32(h >> uint64(32))))
-    y = reverse_bits(scramble_reversed(pascal(i), uint32(g)))
+    # The halves of h are independent; their product's upper half is a third seed at the price of one multiplication.
+    y = reverse_bits(scramble_reversed(pascal(i), uint32((h * uint64(0x9E3779B97F4A7C15)) >> uint64(32))))
     return unit_float(x), unit_float(y)
 
 

@@ -63,9 +63,12 @@ class Tables(NamedTuple):
 
     Attributes
     ----------
-    corners, normals, colors : (t, 3, 3) float32
-        By triangle, corner and axis or channel; (0, 3, 3) where no mesh has normals or colours.
-    triangle_material : (t,) uint32
+    corners : (t, 10) float32
+        By triangle: the corners' nine coordinates, then the material's index as the bits of a uint32.
+    corner_bits : (t, 10) uint32
+        The same memory.
+    normals, colors : (t, 3, 3) float32
+        By triangle, corner and axis or channel; (0, 3, 3) where no mesh has any.
     item_first_triangle : (1 + i,) int64
     item_transform, item_normal : (1 + i, 3, 4) and (1 + i, 3, 3) float64
         Of points, and of normals up to a positive factor.
@@ -73,9 +76,9 @@ class Tables(NamedTuple):
 
     handle: np.uint64
     corners: NDArray[np.float32]
+    corner_bits: NDArray[np.uint32]
     normals: NDArray[np.float32]
     colors: NDArray[np.float32]
-    triangle_material: NDArray[np.uint32]
     item_first_triangle: NDArray[np.int64]
     item_transform: NDArray[np.float64]
     item_normal: NDArray[np.float64]
@@ -106,14 +109,17 @@ class Tracer:
             ``*.unsupported`` for what transport does not model yet.
         """
         geometry = embree.Geometry(scene)
+        corners = np.empty((len(scene.indices), 10), np.float32)
+        corners[:, :9] = scene.positions[scene.indices].reshape(-1, 9)
+        corners[:, 9] = scene.triangle_material.view(np.float32)
         lights = merge_lights(scene, spec)
         transforms = np.concatenate([np.eye(3, 4)[None], scene.instance_transform.reshape(-1, 3, 4)])
         tables = Tables(
             handle=np.uint64(geometry.handle),
-            corners=scene.positions[scene.indices],
+            corners=corners,
+            corner_bits=corners.view(np.uint32),
             normals=scene.normals[scene.indices] if len(scene.normals) else np.zeros((0, 3, 3), np.float32),
             colors=scene.colors[scene.indices, :3] if len(scene.colors) else np.zeros((0, 3, 3), np.float32),
-            triangle_material=scene.triangle_material,
             item_first_triangle=np.concatenate([scene.mesh_first_triangle[:1], scene.mesh_first_triangle[scene.instance_mesh]]),
             item_transform=transforms,
             item_normal=_normal_matrices(transforms[:, :, :3]),
@@ -160,9 +166,9 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     scale = 1.0 / (b0 + b1 + b2)
     b0, b1, b2 = b0 * scale, b1 * scale, b2 * scale
     corner = t.corners[triangle]
-    ax, ay, az = float(corner[0, 0]), float(corner[0, 1]), float(corner[0, 2])
-    bx, by, bz = float(corner[1, 0]), float(corner[1, 1]), float(corner[1, 2])
-    cx, cy, cz = float(corner[2, 0]), float(corner[2, 1]), float(corner[2, 2])
+    ax, ay, az = float(corner[0]), float(corner[1]), float(corner[2])
+    bx, by, bz = float(corner[3]), float(corner[4]), float(corner[5])
+    cx, cy, cz = float(corner[6]), float(corner[7]), float(corner[8])
     ex, ey, ez = bx - ax, by - ay, bz - az
     fx, fy, fz = cx - ax, cy - ay, cz - az
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
@@ -226,7 +232,7 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
         red = b0 * c[0, 0] + b1 * c[1, 0] + b2 * c[2, 0]
         green = b0 * c[0, 1] + b1 * c[1, 1] + b2 * c[2, 1]
         blue = b0 * c[0, 2] + b1 * c[1, 2] + b2 * c[2, 2]
-    material = t.triangle_material[triangle]
+    material = t.corner_bits[triangle, 9]
     return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front
 
 
@@ -315,26 +321,6 @@ def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-
 
 
 @kernel
-def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: ignore[no-untyped-def]
-    """Nearest hit; with `through_backs`, back faces of single-sided materials are passed, as a rasteriser that culls them does.
-
-    Returns (hit, surface). Without a hit the surface means nothing.
-    """
-    for _ in range(_MAX_PASSED):
-        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE)
-        intersect1(t.handle, ray.ctypes.data, 0)
-        if ray_bits[18] == _INVALID:
-            break
-        s = surface(t, ray_bits, ray, dx, dy, dz)
-        if s[5] or not through_backs or t.materials.double_sided[s[4]]:
-            return True, s
-        # Leave on the far side: the surface's normal looks back at us.
-        ox, oy, oz = s[0][0] - s[2] * s[1][0], s[0][1] - s[2] * s[1][1], s[0][2] - s[2] * s[1][2]
-    nothing = (0.0, 0.0, 0.0)
-    return False, (nothing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, nothing, np.uint32(0), True)
-
-
-@kernel
 def sample_pair(reversed_index, index, depth, key):
     """Two sample coordinates of a path's vertex: stratified at the first vertices, plain random numbers after."""
     if depth <= STRATIFIED_VERTICES:
@@ -356,7 +342,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     reversed_index, index, key
         Sample point: its index within its scramble, with bits reversed and plain, and what picks the scramble.
     camera : bool
-        Pass through back faces on the first ray.
+        Whether the ray itself passes through back faces of single-sided materials, as a rasteriser's does that culls them.
 
     Returns
     -------
@@ -382,6 +368,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     pdf = 0.0
     hit_any = False
     emitter_pdf = 0.0
+    passed = 0
     depth = 0
     has_emitters = t.emitters.cdf.shape[0] > 0
     has_lights = t.lights.cdf.shape[0] > 0
@@ -395,8 +382,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_g += beta_g / survival * t.environment[1]
                 indirect_b += beta_b / survival * t.environment[2]
             break
-        hit, s = find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, camera and depth == 0)
-        if not hit:
+        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE)
+        intersect1(t.handle, ray.ctypes.data, 0)
+        if ray_bits[18] == _INVALID:
             # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = t.environment[0], t.environment[1], t.environment[2]
@@ -405,12 +393,18 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_g += beta_g / survival * t.environment[1]
                 indirect_b += beta_b / survival * t.environment[2]
             break
-        p, n, epsilon, color, material, front = s
+        p, n, epsilon, color, material, front = surface(t, ray_bits, ray, dx, dy, dz)
         two_sided = t.materials.double_sided[material]
+        if not front and not two_sided:
+            if camera and depth == 0 and passed < _MAX_PASSED:
+                # Go on from the far side: the normal looks back at us.
+                ox, oy, oz = p[0] - epsilon * n[0], p[1] - epsilon * n[1], p[2] - epsilon * n[2]
+                passed += 1
+                continue
+            hit_any = hit_any or depth == 0
+            break
         if depth == 0:
             hit_any = True
-        if not front and not two_sided:
-            break
         dark += 1
         le_r, le_g, le_b = (
             float(t.materials.emission[material, 0]),
