@@ -31,7 +31,8 @@ SCRAMBLES = 4
 # A probe's capture texels are summed in this many blocks, which threads may share: fixed, so that sums are the same bits for any number
 # of threads.
 BLOCKS = 4
-# Emitters seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses it, and the
+# Emitters seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses it,
+# and the
 # edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.03 %.
 _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
@@ -42,7 +43,7 @@ _NOTHING = 0xFFFFFFFF
 
 
 @kernel
-def _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance):
+def _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance):  # type: ignore[no-untyped-def]
     """Irradiance straight from emitters, one light sample a round; its weight is what the balance heuristic leaves to light samples.
 
     Parameters

@@ -245,14 +245,14 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
 
 
 @kernel
-def pdf_emitter(t, strength, two_sided, d2, facing):
+def pdf_emitter(t, strength, two_sided, d2, facing):  # type: ignore[no-untyped-def]
     """Per solid angle, of :func:`sample_emitter`, seen from a distance of √d2 under a cosine of `facing` at the emitter."""
     sides = 2.0 if two_sided else 1.0
     return strength * sides / t.emitters.total * d2 / max(facing, 1e-30)
 
 
 @kernel
-def sample_emitter(t, px, py, pz, u, v, w):
+def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
     """A point on the emissive triangles, chosen by power and area, as seen from a point.
 
     Pdf: :func:`pdf_emitter`.
@@ -260,7 +260,8 @@ def sample_emitter(t, px, py, pz, u, v, w):
     Returns
     -------
     (int, 3 float64, float64, 3 float64)
-        The triangle, the unit direction to the point, its pdf per solid angle (0: it shines the other way), and the point lifted off its surface
+        The triangle, the unit direction to the point, its pdf per solid angle (0: it shines the other way), and the point lifted off its
+        surface
         towards the viewer, so that the emitter does not block itself.
     """
     e = t.emitters
@@ -288,7 +289,7 @@ def sample_emitter(t, px, py, pz, u, v, w):
 
 
 @kernel
-def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):
+def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-untyped-def]
     """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
 
     The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
@@ -321,7 +322,7 @@ def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-
 
 
 @kernel
-def sample_pair(reversed_index, index, depth, key):
+def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-def]
     """Two sample coordinates of a path's vertex: stratified at the first vertices, plain random numbers after."""
     if depth <= STRATIFIED_VERTICES:
         return sobol_pair(reversed_index, key)
