@@ -22,11 +22,12 @@ system-packages:
 	@PYTHON=$(PYTHON) .ci/system-packages
 
 # Hashes for every package, wheels only: nothing is fetched that is not pinned, build tools included. The stamp makes a second setup quick.
+# Bytecode is left to the first import: of all that is installed only a part is ever imported, and compiling all of it takes half the time.
 $(BIN)/.installed: $(LOCKS) $(PROJECTS) | system-packages
 	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit(f"setup: Python 3.11 or newer is needed and $(PYTHON) is {v[0]}.{v[1]}; name another with: make setup PYTHON=...")'
 	@echo "setup: Python packages into .venv"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: --require-hashes $(LOCKS:%=-r %)
+	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --only-binary :all: --require-hashes $(LOCKS:%=-r %)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation -e . -e clients/python
 	@touch $@
 
