@@ -123,8 +123,18 @@ def relative_error(sums: F64, samples: int, active: NDArray[np.bool_]) -> float 
     mean = float(per_probe.mean())
     if mean == 0:
         return 0.0
-    # Each probe's figure scatters like χ² with at least r - 1 degrees of freedom (its texels share paths, so no more are claimed);
-    # Satterthwaite 1946 for their mean, Wilson and Hilferty 1931 for the quantile.
-    freedom = (r - 1) * float(per_probe.sum()) ** 2 / float((per_probe**2).sum())
-    lower = max(1 - 2 / (9 * freedom) - _Z95 * math.sqrt(2 / (9 * freedom)), 0.05) ** 3
-    return math.sqrt(mean / lower)
+    # How many probes' worth of errors there are: Satterthwaite 1946, and his sum of squares without its bias. A probe counts as one number,
+    # because its texels share paths.
+    n = min(float(per_probe.sum()) ** 2 / float((per_probe**2).sum()) * (r + 1) / (r - 1), len(per_probe))
+    # The error itself scatters like χ² of n degrees of freedom, what is known of it like n (r - 1): their quotient is F-distributed.
+    return math.sqrt(mean * _f95(n, n * (r - 1)))
+
+
+def _f95(m: float, n: float) -> float:
+    """The 95 % point of the F distribution with m ≥ 1 and n ≥ 3 degrees of freedom: Paulson 1942, Ann. Math. Stat. 13(2).
+
+    4 % too large at (1, 3), within 0.2 % from (2, 6) on.
+    """
+    a, b = 2 / (9 * m), 2 / (9 * n)
+    p, q = 1 - a, 1 - b
+    return ((p * q + _Z95 * math.sqrt(p * p * b + q * q * a - a * b * _Z95**2)) / (q * q - b * _Z95**2)) ** 3

@@ -1,0 +1,145 @@
+"""Sums as bytes and back, and passes that may only be added whole and in turn."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bake_core.tally import BACKFACE_LIMIT, State, Tally
+
+Array = NDArray[Any]
+PROBES, SCRAMBLES, TEXELS = 6, 4, 9
+
+
+def tally(probes: tuple[int, int], samples: tuple[int, int], *, seed: int = 0, radiance: bool = True) -> Tally:
+    """A shard's part of a pass: numbers that depend on the probe, not on the shard."""
+    n = probes[1] - probes[0]
+    random = np.random.default_rng(seed)
+    whole = random.random((PROBES, SCRAMBLES, TEXELS, 3))[slice(*probes)]
+    first = samples[0] == 0
+    return Tally(
+        *probes,
+        *samples,
+        irradiance=whole,
+        radiance=random.random((PROBES, 16, 3))[slice(*probes)] if radiance else np.zeros((0, 0, 0)),
+        visibility=random.random((PROBES, 2, 2, 2))[slice(*probes)].astype(np.float32) if first else np.zeros((0, 0, 0, 0), np.float32),
+        backface=np.linspace(0, 0.5, PROBES, dtype=np.float32)[slice(*probes)] if first else np.zeros(0, np.float32),
+        distance=np.full((n, 4), 2.0, np.float32) if first else np.zeros((0, 0), np.float32),
+        normal=np.full((n, 4, 3), 1.0, np.float32) if first else np.zeros((0, 0, 0), np.float32),
+    )
+
+
+def empty() -> State:
+    return State(
+        samples=0,
+        irradiance=np.zeros((PROBES, SCRAMBLES, TEXELS, 3)),
+        radiance=np.zeros((PROBES, 16, 3)),
+        visibility=np.zeros((PROBES, 2, 2, 2), np.float32),
+        backface=np.zeros(PROBES, np.float32),
+        distance=np.zeros((PROBES, 4), np.float32),
+        normal=np.zeros((PROBES, 4, 3), np.float32),
+    )
+
+
+def equal(a: Tally | State, b: Tally | State) -> bool:
+    def same(x: Any, y: Any) -> bool:
+        if isinstance(x, np.ndarray):
+            return x.dtype == y.dtype and x.shape == y.shape and np.array_equal(x, y)
+        return type(x) is type(y) and bool(x == y)
+
+    return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+
+
+@pytest.mark.parametrize("samples", [(0, 16), (16, 32)])
+def test_a_tally_comes_back_from_its_bytes(samples: tuple[int, int]) -> None:
+    t = tally((1, 4), samples)
+    data = t.to_bytes()
+    assert equal(Tally.from_bytes(data), t)
+    assert Tally.from_bytes(data).to_bytes() == data == tally((1, 4), samples).to_bytes()
+
+
+def test_a_state_comes_back_from_its_bytes_and_can_go_on() -> None:
+    state = empty()
+    state.add([tally((0, PROBES), (0, 16))])
+    data = state.to_bytes()
+    again = State.from_bytes(data)
+    assert equal(again, state) and again.to_bytes() == data
+    for s in (state, again):
+        s.add([tally((0, PROBES), (16, 32), seed=1)])
+    assert again.to_bytes() == state.to_bytes()
+
+
+def test_bytes_hold_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    data = tally((0, 2), (0, 16)).to_bytes()
+    later = time.time() + 86_400 * 400
+    monkeypatch.setattr(time, "time", lambda: later)
+    assert tally((0, 2), (0, 16)).to_bytes() == data
+
+
+def test_the_sum_does_not_depend_on_shards_or_their_order() -> None:
+    splits = [[(0, 6)], [(0, 1), (1, 4), (4, 6)], [(4, 6), (0, 1), (1, 4)], [(i, i + 1) for i in range(6)]]
+    sums = []
+    for split in splits:
+        state = empty()
+        for k, samples in enumerate(((0, 16), (16, 32), (32, 64))):
+            state.add([tally(probes, samples, seed=k) for probes in split])
+        sums.append(state.to_bytes())
+    assert len(set(sums)) == 1
+
+
+def test_what_a_pass_adds() -> None:
+    state = empty()
+    first, second = tally((0, PROBES), (0, 16)), tally((0, PROBES), (16, 32), seed=1)
+    state.add([first])
+    state.add([second])
+    assert state.samples == 32
+    np.testing.assert_array_equal(state.irradiance, first.irradiance + second.irradiance)
+    np.testing.assert_array_equal(state.radiance, first.radiance + second.radiance)
+    for name in ("visibility", "backface", "distance", "normal"):  # of the first pass only
+        np.testing.assert_array_equal(getattr(state, name), getattr(first, name))
+
+
+def test_what_is_not_kept_is_not_added() -> None:
+    state = replace(empty(), radiance=np.zeros((0, 0, 0)), distance=np.zeros((0, 0), np.float32))
+    state.add([tally((0, PROBES), (0, 16), radiance=False)])
+    assert not state.radiance.size and not state.distance.size
+
+
+@pytest.mark.parametrize(
+    "passes",
+    [
+        [],  # no tally at all
+        [((0, 3), (0, 16))],  # the end is missing
+        [((1, 6), (0, 16))],  # the beginning
+        [((0, 2), (0, 16)), ((3, 6), (0, 16))],  # a gap
+        [((0, 4), (0, 16)), ((3, 6), (0, 16))],  # an overlap
+        [((0, 3), (0, 16)), ((0, 3), (0, 16)), ((3, 6), (0, 16))],  # a shard twice
+        [((0, 3), (0, 16)), ((3, 6), (0, 8))],  # of two passes
+        [((0, 6), (16, 32))],  # not the next pass
+    ],
+)
+def test_what_is_not_the_next_whole_pass_is_refused_and_changes_nothing(passes: list[Any]) -> None:
+    state = empty()
+    with pytest.raises(ValueError, match="pass"):
+        state.add([tally(*p) for p in passes])
+    assert equal(state, empty())
+
+
+def test_a_pass_added_twice_is_refused() -> None:
+    state = empty()
+    state.add([tally((0, 6), (0, 16))])
+    with pytest.raises(ValueError, match="does not follow"):
+        state.add([tally((0, 6), (0, 16))])
+
+
+def test_probes_that_see_backs_are_inactive() -> None:
+    state = empty()
+    state.add([tally((0, 6), (0, 16))])
+    np.testing.assert_array_equal(state.active(), np.linspace(0, 0.5, 6) < BACKFACE_LIMIT)
+    assert not replace(state, backface=np.full(6, BACKFACE_LIMIT, np.float32)).active().any()
