@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bake_core.bundle import VolumeData
 from bake_core.cameras import DEFAULT_YFOV, looking
 from bake_core.comparison import LUMINANCE
+from bake_core.irradiance import covered
 from bake_core.raster import Rasterizer
 from bake_core.scene import Camera, Scene
 
@@ -22,9 +23,11 @@ COUNT = 3
 _WIDTH, _HEIGHT = 48, 27
 # Vertices of all glimpses together; bounds the search to some seconds on a CPU whatever the scene.
 _VERTEX_BUDGET = 30_000_000
-_MOST_PLACES, _FEWEST_PLACES, _TURNS = 24, 4, 8
+_MOST_PLACES, _FEWEST_PLACES, _TURNS = 40, 5, 8
 # Looking a little down, as people do: floors show more of a room's light than ceilings.
 _PITCH = math.radians(-12)
+# Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": the root of x⁴ = x + 1 spreads points in three dimensions.
+_SPREAD = 1 / 1.2207440846057596 ** np.arange(1, 4)
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,16 @@ def automatic_cameras(rasterizer: Rasterizer, scene: Scene, volumes: Sequence[Vo
     places = _places(volumes, _how_many(scene))
     low, high = places.min(0), places.max(0)
     reach = float(np.linalg.norm(high - low)) or float(max(v.spacing.max() for v in volumes))
-    views = []
+    glimpses = []
     for position in places:
         for towards in _directions(position, (low + high) / 2):
             camera = Camera("", looking(position, position + towards), DEFAULT_YFOV)
-            picture, distances = rasterizer.glimpse(camera, _WIDTH, _HEIGHT)
-            views.append(_View(position, towards, _score((picture.indirect + picture.emission) @ LUMINANCE, distances, reach)))
+            picture, points = rasterizer.glimpse(camera, _WIDTH, _HEIGHT)
+            light = (picture.indirect + picture.emission) @ LUMINANCE
+            # What lies beyond the volumes is not worth looking at: the bundle promises nothing there.
+            light[~covered(volumes, points.reshape(-1, 3)).reshape(light.shape)] = 0
+            glimpses.append((position, towards, light, np.linalg.norm(points - position, axis=-1)))
+    views = _scored(glimpses, reach)
     chosen: list[_View] = []
     while len(chosen) < COUNT:
         scores = [v.score * math.prod(1 - 0.9 * _alike(v, c, reach) for c in chosen) for v in views]
@@ -76,7 +83,7 @@ def _how_many(scene: Scene) -> int:
 
 
 def _places(volumes: Sequence[VolumeData], count: int) -> F64:
-    """Probe positions far from each other, (at most `count`, 3), of those that see the fewest back faces."""
+    """Probe positions spread over the volumes, (at most `count`, 3), of those that see the fewest back faces."""
     positions, backs = [], []
     for v in volumes:
         lattice = np.stack(np.unravel_index(np.arange(len(v.states)), tuple(v.counts[::-1]))[::-1], -1)
@@ -86,13 +93,32 @@ def _places(volumes: Sequence[VolumeData], count: int) -> F64:
     position, back = np.concatenate(positions), np.concatenate(backs)
     # A probe that sees back faces stands behind something single-sided, outside of what is to be looked at.
     position = position[back <= max(0.02, float(back.min()))]
-    middle = (position.min(0) + position.max(0)) / 2
-    chosen = [int(((position - middle) ** 2).sum(1).argmin())]
-    distance = ((position - position[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < min(count, len(position)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, ((position - position[chosen[-1]]) ** 2).sum(1))
-    return position[chosen]
+    low, high = position.min(0), position.max(0)
+    wanted = low + (high - low) * ((0.5 + np.arange(count)[:, None] * _SPREAD) % 1)
+    nearest = [int(((position - w) ** 2).sum(1).argmin()) for w in wanted]
+    return position[list(dict.fromkeys(nearest))]
+
+
+def _scored(glimpses: Sequence[tuple[F64, F64, NDArray[np.floating], F64]], reach: float) -> list[_View]:
+    """Views with their scores, from (place, direction, light, distances)."""
+    shining = np.concatenate([light[light > 0] for _, _, light, _ in glimpses])
+    # A fiftieth of what is bright here: less is a dark room, perhaps with light leaking into it.
+    dark = 0.02 * float(np.quantile(shining, 0.9)) if shining.size else 0.0
+    lit_around = {tuple(place): 0.0 for place, _, _, _ in glimpses}
+    around: dict[tuple[float, ...], list[F64]] = {place: [] for place in lit_around}
+    for place, _, light, distances in glimpses:
+        lit_around[tuple(place)] += float((light > dark).mean())
+        around[tuple(place)].append(distances[np.isfinite(distances)])
+    most = max(lit_around.values())
+    out = []
+    for place, towards, light, distances in glimpses:
+        # A place with lit surface all around is inside of something; the open front of a room will do, a field is the last place to go.
+        inside = min(1.0, 1.5 * lit_around[tuple(place)] / most) ** 3 if most else 0.0
+        # What is near is judged by the room that one stands in as well as by the whole.
+        room = np.concatenate(around[tuple(place)])
+        scale = math.sqrt(reach * min(reach, float(np.quantile(room, 0.75)))) if room.size else reach
+        out.append(_View(place, towards, inside * _score(np.where(light > dark, light, 0), distances, scale)))
+    return out
 
 
 def _score(light: NDArray[np.floating], distances: F64, reach: float) -> float:

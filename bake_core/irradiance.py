@@ -94,6 +94,19 @@ def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
     return nearest
 
 
+def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.bool_]:
+    """Whether each point (n, 3) is within half a spacing of a volume's box: where a bundle's light can be held against the truth.
+
+    Farther out, the nearest cell answers, which is defined but no more than a guess.
+    """
+    positions = np.asarray(positions, np.float64)
+    out = np.zeros(len(positions), np.bool_)
+    for volume in volumes:
+        g = (positions - volume.origin) / volume.spacing
+        out |= ((g >= -0.5) & (g <= volume.counts - 0.5)).all(-1)
+    return out
+
+
 def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
     """The cell around each point, the nearest one where it is outside. Mirrors ``obCell``.
 

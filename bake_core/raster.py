@@ -112,28 +112,31 @@ class Rasterizer:
         -------
         picture : Picture
             Without direct light.
-        distances : (height, width) float64
-            How far along the camera's axis surfaces are, metres; inf where there is none.
+        points : (height, width, 3) float64
+            What is seen, world, metres; NaN where nothing is.
         """
         if not self._draws:
-            return _empty(self._environment, width, height), np.full((height, width), np.inf)
+            return _empty(self._environment, width, height), np.full((height, width, 3), np.nan)
         targets = self._targets_of(width, height)
         lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
         self._draw(lens, targets, (0.0, 0.0), (0, 0))
         direct, indirect, emission = (b.read(np.float32, (height, width, 4)) for b in targets.download)
         picture = Picture(direct[..., :3], indirect[..., :3], emission[..., :3], emission[..., 3])
-        return picture, self._distances(lens, targets)
+        return picture, self._points(lens, targets, 0.0) + self._origin
 
     def _targets_of(self, width: int, height: int) -> _Targets:
         if (width, height) not in self._targets:
             self._targets[width, height] = _Targets.make(self._device, width, height)
         return self._targets[width, height]
 
-    def _distances(self, lens: _Lens, targets: _Targets) -> F64:
-        """Distance along the camera's axis to what was last drawn, (height, width) float64 in metres; inf where nothing was."""
+    def _points(self, lens: _Lens, targets: _Targets, shift: float) -> F64:
+        """Points of the local frame that were last drawn, (height, width, 3), NaN where none was; `shift` as it was drawn."""
+        height, width = targets.depth.height, targets.depth.width
         self._device.run(lambda commands: commands.download(targets.depth, targets.download[0]))
-        depth = targets.download[0].read(np.float32, (targets.depth.height, targets.depth.width)).astype(np.float64)
-        return np.divide(lens.near, depth, out=np.full_like(depth, np.inf), where=depth > 0)
+        depth = targets.download[0].read(np.float32, (height, width)).astype(np.float64)
+        distance = np.divide(lens.near, depth, out=np.full_like(depth, np.nan), where=depth > 0)
+        x, y = np.meshgrid(np.arange(width) + 0.5 + shift, np.arange(height) + 0.5 + shift)
+        return lens.points(x, y, distance)
 
     def _visible(self, lens: _Lens, targets: _Targets) -> F64:
         """Points on what the picture shows, for shadow maps to be fitted to; the scene's corners where it shows nothing."""
@@ -141,11 +144,10 @@ class Rasterizer:
         # Opposite corners of the pixels: towards a horizon, half a pixel is a long way.
         for shift in (-0.5, 0.5):
             self._draw(lens, targets, (shift, shift), (0, 0))
-            distances = self._distances(lens, targets)
-            rows, columns = np.nonzero(np.isfinite(distances))
-            found.append(lens.points(columns + 0.5 + shift, rows + 0.5 + shift, distances[rows, columns]))
-        points = np.concatenate(found)
-        return points if len(points) else corners(self._bounds)
+            points = self._points(lens, targets, shift)
+            found.append(points[np.isfinite(points[..., 0])])
+        seen = np.concatenate(found)
+        return seen if len(seen) else corners(self._bounds)
 
     def _draw_shadows(self, batch: Batch, receivers: F64) -> None:
         if not batch.views:
@@ -232,7 +234,7 @@ class _Lens:
         right, up, back = self.axes
         across = (2 * x / self.width - 1) * self.tangents[0] * distance
         down = (2 * y / self.height - 1) * self.tangents[1] * distance
-        out: F64 = self.eye + across[:, None] * right - down[:, None] * up - distance[:, None] * back
+        out: F64 = self.eye + across[..., None] * right - down[..., None] * up - distance[..., None] * back
         return out
 
 

@@ -18,6 +18,7 @@ from bake_core.automatic_cameras import automatic_cameras
 from bake_core.bundle import Bundle, content_digest, dump_json
 from bake_core.comparison import Figures, compare
 from bake_core.errors import BundleError, InputError
+from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
 from bake_core.raster import Rasterizer
@@ -105,7 +106,8 @@ def verify(
                 rastered = time.perf_counter()
                 halves = _halves(tracer, camera, width, height, samples, spec, threads, tell.part(i, len(cameras)), cancelled)
                 seconds = {"raster": rastered - begun, "path": time.perf_counter() - rastered}
-                entries.append(_entry(work, camera, name, raster, halves, thresholds, seconds))
+                inside = _inside(rasterizer, bundle, camera, width, height)
+                entries.append(_entry(work, camera, name, raster, halves, inside, thresholds, seconds))
             name = device.name
         tell("writing", 1.0)
         report: dict[str, Any] = {
@@ -193,22 +195,30 @@ def _halves(
     return half(0), half(1)
 
 
+def _inside(rasterizer: Rasterizer, bundle: Bundle, camera: Camera, width: int, height: int) -> NDArray[np.bool_]:
+    """Pixels that may count, (height, width): all but those whose centre shows a surface that the volumes do not reach."""
+    _, points = rasterizer.glimpse(camera, width, height)
+    return covered(bundle.volumes, points.reshape(-1, 3)).reshape(height, width) | np.isnan(points[..., 0])
+
+
 def _entry(
     work: Path,
     camera: Camera,
     name: str,
     raster: Picture,
     halves: tuple[Picture, Picture],
+    inside: NDArray[np.bool_],
     thresholds: Thresholds,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """One camera's part of the report; writes its pictures."""
     surface = (raster.hit > 0) | (halves[0].hit > 0) | (halves[1].hit > 0)
+    counted = surface & inside
     figures: dict[str, Figures] = {}
     files: dict[str, dict[str, str]] = {}
     for part in PARTS:
         picture, first, second = (getattr(p, part) for p in (raster, *halves))
-        figures[part] = compare(picture, (first, second), surface)
+        figures[part] = compare(picture, (first, second), counted)
         files[part] = write_pictures(work, name, part, picture, (first + second) / 2)
     return {
         "name": camera.name or name,
@@ -216,6 +226,7 @@ def _entry(
         "direction": (-camera.matrix[:3, 2]).tolist(),
         "yfov": camera.yfov,
         "surface": float(surface.mean()),
+        "counted": float(counted.mean()),
         **{part: asdict(f) for part, f in figures.items()},
         "failures": thresholds.failures(figures),
         "files": files,

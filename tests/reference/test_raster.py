@@ -78,7 +78,7 @@ def test_the_environment_stands_behind_everything_and_back_faces_are_not_there(t
     scene, spec = scene_of(tmp_path, w), spec_of(environment=(0.25, 0.5, 4))
     picture = raster(scene, spec, eye((0, -1, 0), (0, 0, 0)), constant_volume((1, 1, 1)))
     assert not picture.hit.any()
-    np.testing.assert_array_equal(picture.emission, np.broadcast_to(np.float32([0.25, 0.5, 4]), picture.emission.shape))
+    np.testing.assert_array_equal(picture.emission, np.broadcast_to(np.array([0.25, 0.5, 4], np.float32), picture.emission.shape))
     assert not picture.indirect.any()
     above = raster(scene, spec, eye((0, 4, 0), (0, 0, 0)), constant_volume((1, 1, 1)))
     assert 0.1 < above.hit.mean() < 0.9
@@ -197,7 +197,7 @@ def test_a_scene_a_million_metres_from_zero_looks_the_same(tmp_path: Path) -> No
 def test_a_scene_without_geometry_is_its_environment(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, GlbWriter())
     picture = raster(scene, spec_of(environment=(1, 2, 3)), eye((0, 0, 0), (0, 0, -1)), constant_volume((1, 1, 1)))
-    np.testing.assert_array_equal(picture.whole, np.broadcast_to(np.float32([1, 2, 3]), picture.whole.shape))
+    np.testing.assert_array_equal(picture.whole, np.broadcast_to(np.array([1, 2, 3], np.float32), picture.whole.shape))
     assert not picture.hit.any()
 
 

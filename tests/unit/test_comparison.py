@@ -16,7 +16,7 @@ def noisy(value: float, seed: int, sigma: float = 0.5) -> np.ndarray:
 
 
 def test_a_picture_five_per_cent_too_bright_is_told_so_through_noise() -> None:
-    """relMSE of a constant factor 1.05 is 0.05² / (1 + 0.1²); the noise of the halves, ten times as much, stays out of it."""
+    """Of a constant factor 1.05 it is 0.05² / (1 + 0.1²); the noise of the halves, ten times as much, stays out of it."""
     picture = np.full((60, 80, 3), 2.1, np.float32)
     figures = compare(picture, (noisy(2, 1, 0.3), noisy(2, 2, 0.3)), EVERYWHERE)
     assert figures.mean_ratio == pytest.approx(1.05, abs=0.01)

@@ -139,3 +139,9 @@ def test_irradiance_follows_the_normal_and_errs_as_bilinear_interpolation_does()
     assert worst[0] < 0.04
     assert worst[0] > 1.5 * worst[1] > 2.25 * worst[2]
     assert typical[0] > 2.5 * typical[1] > 6.25 * typical[2]
+
+
+def test_a_point_half_a_spacing_outside_is_still_covered() -> None:
+    volume = in_the_open((3, 1, 1))
+    points = [[-0.5, 0, 0], [2.5, 0.5, -0.5], [-0.6, 0, 0], [1, 0.6, 0], [1, 0, np.nan]]
+    assert irradiance.covered((volume,), points).tolist() == [True, True, False, False, False]

@@ -84,7 +84,8 @@ def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_without_a_driver_the_package_to_install_is_named() -> None:
     """In a process of its own: the loader reads this variable once."""
-    code = "from bake_core.errors import MachineError\nfrom bake_core.vulkan import Device\ntry:\n    Device()\nexcept MachineError as e:\n    print(e.slug, e)"
+    lines = ("from bake_core.errors import MachineError", "from bake_core.vulkan import Device", "try:", "    Device()")
+    code = "\n".join((*lines, "except MachineError as e:", "    print(e.slug, e)"))
     environment = os.environ | {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("vulkan.missing")
