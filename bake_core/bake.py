@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -26,6 +25,7 @@ from bake_core.assemble import assemble
 from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, Verdict, decide, fit_pass, next_pass
+from bake_core.errors import MachineError
 from bake_core.filtering import visibility_moments
 from bake_core.gltf.reader import load_scene
 from bake_core.octahedral import texel_solid_angles
@@ -197,16 +197,24 @@ def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, A
     -------
     dict
         The manifest.
+
+    Raises
+    ------
+    MachineError
+        ``machine.cannot_write``; what stood there before still does.
+    BakeError
     """
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
-        work = Path(folder) / "bundle"
-        work.mkdir()
-        manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
-        written = bundle.dump_json(manifest)
-        (work / bundle.MANIFEST).write_bytes(written)
-        report.write(work, manifest, bundle.content_digest(written), asdict(run))
-        shutil.move(work, Path(folder).with_name(Path(folder).name + "-bundle"))
-        bundle.publish(Path(folder).with_name(Path(folder).name + "-bundle"), out)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
+            work = Path(folder) / "bundle"
+            work.mkdir()
+            manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
+            written = bundle.dump_json(manifest)
+            (work / bundle.MANIFEST).write_bytes(written)
+            report.write(work, manifest, bundle.content_digest(written), asdict(run))
+            bundle.publish(work, out)
+    except OSError as e:
+        raise MachineError("machine.cannot_write", f"{e.strerror or e}; is there room on the disk?", str(out)) from e
     return manifest
 
 

@@ -142,9 +142,17 @@ def check_replaceable(out: Path) -> None:
 
 def _names_format(manifest: Path) -> bool:
     try:
-        return bool(json.loads(manifest.read_bytes()).get("format") == FORMAT)
-    except (OSError, ValueError, AttributeError):
+        return _is_ours(manifest.read_bytes())
+    except OSError:
         return False
+
+
+def _is_ours(manifest: bytes) -> bool:
+    try:
+        document = strict_json.parse(manifest, BundleError, "bundle", MANIFEST)
+    except BundleError:
+        return False
+    return isinstance(document, dict) and document.get("format") == FORMAT
 
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
@@ -152,11 +160,9 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as e:
         raise BundleError("bundle.unreadable", f"cannot be read as a zip file: {e}", str(path)) from None
-    try:
-        if json.loads(archive.read(MANIFEST)).get("format") == FORMAT:
+    with suppress(KeyError, zipfile.BadZipFile, zlib.error, OSError):
+        if _is_ours(archive.read(MANIFEST)):
             return archive
-    except (KeyError, ValueError, AttributeError, zipfile.BadZipFile, OSError):
-        pass
     archive.close()
     raise BundleError("bundle.not_a_bundle", f"has no {MANIFEST} of format {FORMAT}", str(path))
 
@@ -210,7 +216,11 @@ def publish(folder: Path, out: Path) -> None:
             # A folder cannot replace one that has files in it: move the old one out of the way first.
             old = folder.with_name(folder.name + ".old")
             out.replace(old)
-            folder.replace(out)
+            try:
+                folder.replace(out)
+            except OSError:
+                old.replace(out)
+                raise
             shutil.rmtree(old)
         else:
             folder.replace(out)
@@ -241,9 +251,10 @@ def read_bundle(path: str | Path) -> Bundle:
     if not path.is_file():
         raise BundleError("bundle.unreadable", "does not exist", str(path))
     with _open_zip(path) as archive, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
-        names = json.loads(archive.read(MANIFEST)).get("files", {})
+        names = json.loads(archive.read(MANIFEST)).get("files")
         try:
-            for name in [MANIFEST, *names]:
+            # What else is wrong with it, reading the folder tells.
+            for name in [MANIFEST, *(names if isinstance(names, dict) else ())]:
                 target = _inside(Path(folder), name, path)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(name) as source, target.open("wb") as copy:
@@ -286,13 +297,16 @@ def _read_folder(folder: Path, path: Path) -> Bundle:
             if not file.is_file() or digest_file(file) != entry["sha256"]:
                 raise BundleError("bundle.damaged", f"{name} is missing or not what the manifest says; fetch or bake it again", str(path))
         return Bundle(manifest, tuple(_read_volume(folder, v) for v in manifest["volumes"]), path)
-    except (KeyError, TypeError, ValueError) as e:
+    except (AttributeError, KeyError, TypeError, ValueError) as e:
         raise BundleError("bundle.damaged", f"its manifest lacks or misstates {e}", str(path)) from None
 
 
 def _read_volume(folder: Path, v: dict[str, Any]) -> VolumeData:
     n = int(np.prod(v["counts"]))
     packing = v["layout"]
+    backface = np.asarray(v["probes"]["backface"], np.float32)
+    if len(v["counts"]) != 3 or backface.shape != (n,):
+        raise ValueError(f"volume {v['name']!r}: its counts are not those of its probes")
     atlases = {}
     for a in v["atlases"]:
         pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
@@ -310,7 +324,7 @@ def _read_volume(folder: Path, v: dict[str, Any]) -> VolumeData:
         counts=np.asarray(v["counts"], np.int64),
         states=probes[:, 3].astype(np.uint8),
         offsets=np.ascontiguousarray(probes[:, :3]),
-        backface=np.asarray(v["probes"]["backface"], np.float32),
+        backface=backface,
         parameters=v["parameters"],
         distance_limit=float(v["distance_limit"]),
         atlases=atlases,
