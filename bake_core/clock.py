@@ -10,6 +10,8 @@ from bake_core.spec import Spec, Stop
 
 # Reports a second at most: a terminal cannot show more, and an event store should not keep more.
 _REPORTS_PER_SECOND = 10
+# No time to go is told before this much of the tracing is done: from the first chunk alone it would be hours.
+_ETA_FROM = 0.02
 # Share of the bar kept for reading and building, and for writing.
 _BEFORE, _AFTER = 0.02, 0.03
 
@@ -91,6 +93,6 @@ class Clock:
         self._last_report = now
         eta = None
         traced = (self._fraction - _BEFORE) / (1 - _BEFORE - _AFTER)
-        if self._stage == "tracing" and traced > 0:
+        if self._stage == "tracing" and traced > _ETA_FROM:
             eta = (now - self._tracing_started) * (1 - traced) / traced
         self._callback(Progress(self._stage, self._fraction, self._samples, self._measured, now - self._started, eta))

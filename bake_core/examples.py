@@ -46,7 +46,7 @@ def cornell() -> Example:
     """A Cornell box: a room of 2 × 2 × 2 m, open in front (+z), two boxes, a lamp in the ceiling, and a sun that comes in at the front.
 
     Walls are single-sided and face inwards. Both boxes are one mesh, used twice. The turns are by 3-4-5 triangles, so that the bytes
-    do not hang on a mathematics library. The 6 × 6 × 6 probes span the room up to 5 cm from its walls.
+    do not hang on a mathematics library. The 8 × 8 × 8 probes are 25 cm apart, the outermost half of that from the walls.
     """
     w = GlbWriter()
     white = w.material("white", (0.76, 0.75, 0.72))
@@ -69,7 +69,7 @@ def cornell() -> Example:
     w.node("sun", light=sun, matrix=look_at((0.9, 1.5, 2.0), (0, 0, 0)))
     w.node("front", camera=w.camera(math.radians(56)), matrix=look_at((0.0, 1.02, 0.98), (0.0, 0.92, -1.0)))
     w.node("corner", camera=w.camera(math.radians(62)), matrix=look_at((-0.9, 1.55, 0.92), (0.35, 0.6, -0.5)))
-    grid = {"name": "room", "origin": [-0.95, 0.05, -0.95], "spacing": [0.38, 0.38, 0.38], "counts": [6, 6, 6]}
+    grid = {"name": "room", "origin": [-0.875, 0.125, -0.875], "spacing": [0.25, 0.25, 0.25], "counts": [8, 8, 8]}
     return w.to_glb(), {"version": 1, "volumes": [grid]}
 
 
