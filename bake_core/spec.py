@@ -224,7 +224,7 @@ def _spec_error(error: ValidationError, where: str) -> SpecError:
     for i, part in enumerate(first["loc"]):
         if isinstance(part, int):
             path += f"[{part}]"
-        elif not (i and part in {"constant", "equirect", "directional", "point", "spot", "tuple"} | _UNION_TAGS):
+        elif i != _UNION_TAG.get(str(first["loc"][0])):
             path += ("." if path else "") + str(part)
     place = f"{where}: {path}" if path else where
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
@@ -240,4 +240,5 @@ def _spec_error(error: ValidationError, where: str) -> SpecError:
     return SpecError("spec.invalid", f"{text}; got {json.dumps(first['input'], default=str)[:80]}{more}", place)
 
 
-_UNION_TAGS = {"literal['auto']"}
+# Where in a place pydantic says which member of a union it tried.
+_UNION_TAG = {"environment": 1, "lights": 2, "outputs": 1}
