@@ -99,7 +99,7 @@ def test_cornell(tmp_path: Path) -> None:
         assert (np.abs(camera.matrix[:3, 3] - [0, 1, 0]) < 1).all()
     probes = probes_of(example)
     assert len(probes) == 512
-    np.testing.assert_allclose([probes.min(axis=0), probes.max(axis=0)], [[-0.95, 0.05, -0.95], [0.95, 1.95, 0.95]])
+    np.testing.assert_allclose([probes.min(axis=0), probes.max(axis=0)], [[-0.875, 0.125, -0.875], [0.875, 1.875, 0.875]])
 
 
 def test_plane_under_sun(tmp_path: Path) -> None:
