@@ -1,40 +1,35 @@
-"""The one module of the service that touches Dask: a cluster started here, or somebody's scheduler by URL.
+"""The one module of the service that talks to Dask: a cluster started here, or somebody's scheduler by URL.
 
-Embedded, it is one worker process with one task slot; the kernels bring their own threads. Nothing listens but on loopback, and nothing
-on HTTP.
+Embedded, it is one worker process with one task slot; the kernels bring their own threads. Nothing listens but on loopback.
 """
 
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
+import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeAlias
 from uuid import uuid4
 
-import dask
 from distributed import Client, Future, LocalCluster
 from distributed.core import Status
 
 from bake_core.errors import MachineError
 from service import worker
+from service.dask_configuration import configure
 from service.settings import Settings
 
 log = logging.getLogger("octobake.compute")
 
-CONFIGURATION = {
-    # A lost worker is counted in our store, per piece of work; Dask would blame the tasks that were merely queued behind it.
-    "distributed.scheduler.allowed-failures": 0,
-    "distributed.scheduler.http.routes": [],
-    "distributed.worker.http.routes": [],
-    # Its sampling profiler walks the stacks of our kernels' threads for pages that nobody serves.
-    "distributed.worker.profile.enabled": False,
-    "distributed.comm.timeouts.connect": "10s",
-    "distributed.logging.distributed": "warning",
-}
-# An idle worker closes in a third of this; a shutdown shall take less than two seconds in all.
+# An idle scheduler closes in a third of this; a shutdown shall take less than two seconds in all.
 CLOSE_SECONDS = 0.5
-# What a worker tells: {"key", "address", "began": true} … {"key", "progress": {…}} … {"key", "ended": true}.
+# A worker that ends sooner than this cannot even start: do not try again at once.
+QUICK_DEATH_SECONDS = 1.0
+# What a worker tells: {"key", "address", "began": true} … {"key", "done": 0.3} … {"key", "ended": true}.
 Message: TypeAlias = dict[str, Any]
 
 
@@ -50,20 +45,13 @@ class Compute:
 
     def __init__(self, settings: Settings, hear: Callable[[Message], None]) -> None:
         self._cluster: LocalCluster | None = None
-        dask.config.set(CONFIGURATION)
+        self._worker: _EmbeddedWorker | None = None
+        configure()
         try:
             if not settings.dask:
-                self._cluster = LocalCluster(
-                    n_workers=1,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    dashboard_address=None,
-                    memory_limit=0,
-                    preload=["service.worker"],
-                    local_directory=str(settings.data_folder / "scratch"),
-                    silence_logs=logging.ERROR,
-                )
+                # Both addresses are given because the defaults are every interface, and port 8787 of it.
+                self._cluster = LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR)
+                self._worker = _EmbeddedWorker(self._cluster.scheduler_address, str(settings.data_folder / "scratch"))
             self._client = Client(self._cluster or settings.dask, set_as_default=False, timeout="10s")
         except (OSError, ValueError) as e:
             self.close()
@@ -73,14 +61,17 @@ class Compute:
 
     @property
     def slots(self) -> int:
-        """How many pieces of work can run at once; never 0, so that work queues while a worker is restarted."""
-        slots: int = self._client.scheduler_info(n_workers=0)["total_threads"]
-        return max(1, slots)
+        """How many pieces of work can run at once; never 0, so that work queues while a worker is started again."""
+        return max(1, self._slots())
 
     @property
     def ready(self) -> bool:
-        """Whether there is a scheduler to submit to."""
-        return bool(self._client.status == "running")
+        """Whether there is a worker to submit to."""
+        return bool(self._client.status == "running") and self._slots() > 0
+
+    def _slots(self) -> int:
+        slots: int = self._client.scheduler_info(n_workers=0)["total_threads"]
+        return slots
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Run a function on a worker; every call is its own task, even with the same arguments."""
@@ -91,16 +82,65 @@ class Compute:
         self._client.cancel(futures, force=True)
 
     def restart(self, address: str) -> None:
-        """Kill a worker that does not hear; its nanny starts another."""
+        """Kill a worker that does not hear; another is started in its place."""
         log.warning("restarting the worker at %s, which does not stop", address)
-        self._client.restart_workers([address], raise_for_error=False)
+        if self._worker:
+            self._worker.kill()
+        else:
+            # Where it has no nanny, the task runs on, and the worker is free when it ends.
+            with suppress(ValueError):
+                self._client.restart_workers([address], raise_for_error=False)
 
     def close(self) -> None:
         """Stop what was started here; what runs on somebody else's cluster is released."""
+        if self._worker:
+            self._worker.close()
         client = getattr(self, "_client", None)
         if client is not None and client.status != Status.closed:
             client.close(timeout=CLOSE_SECONDS)
         if self._cluster is not None:
-            # A worker in native code does not hear; it ends with this process, whose death it watches.
             with suppress(TimeoutError):
                 self._cluster.close(timeout=CLOSE_SECONDS)
+
+
+class _EmbeddedWorker:
+    """A worker process, started again whenever it ends.
+
+    Not Dask's nanny, which gives up on a worker that dies while it starts.
+    """
+
+    def __init__(self, scheduler: str, folder: str) -> None:
+        self._command = [sys.executable, "-m", "service.worker_process", scheduler, folder]
+        self._closing = threading.Event()
+        self._process = self._start()
+        self._thread = threading.Thread(target=self._watch, name="octobake-worker", daemon=True)
+        self._thread.start()
+
+    def kill(self) -> None:
+        """End the process at once; it holds nothing that is not stored."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End the process for good."""
+        self._closing.set()
+        self.kill()
+        self._thread.join(CLOSE_SECONDS)
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # Its standard input is how it learns that this process has gone.
+        return subprocess.Popen(self._command, stdin=subprocess.PIPE)
+
+    def _watch(self) -> None:
+        while not self._closing.is_set():
+            began = time.monotonic()
+            code = self._process.wait()
+            if self._closing.is_set():
+                return
+            log.warning("the worker has ended (%d); starting another", code)
+            if time.monotonic() - began < QUICK_DEATH_SECONDS:
+                self._closing.wait(QUICK_DEATH_SECONDS)
+            with self._process:
+                pass  # close our end of its standard input
+            self._process = self._start()
+            if self._closing.is_set():
+                self.kill()

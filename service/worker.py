@@ -1,13 +1,12 @@
 """What runs inside a Dask worker: each function takes and returns names of stored bytes, never the bytes.
 
 A task is told everything it needs in a :class:`Work`, fetches the scene by digest, keeps the last few prepared scenes, and polls a flag
-that Dask's cancel raises. Loaded by every worker at its start (`dask_setup`), so that the first task does not wait for imports.
+that Dask's cancel raises.
 """
 
 from __future__ import annotations
 
 import os
-import signal
 import tempfile
 import threading
 import time
@@ -226,13 +225,3 @@ def _state(work: Work, reference: str | None) -> State:
     if reference is None:
         return bake.empty_state(_prepared(work))
     return State.from_bytes(_blobs(work.store).get_work(work.job, reference))
-
-
-def dask_setup(_: Worker) -> None:
-    """Called by Dask when a worker starts.
-
-    Ctrl-C in the service's terminal, and a service manager's SIGTERM to the whole group, are the service's to act on: a worker that went
-    by itself would be taken for lost. It ends with the service, however that ends.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)

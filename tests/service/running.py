@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # The command as it is installed, from this checkout.
 OCTOBAKE = [sys.executable, "-m", "service.cli"]
 START_SECONDS = 60.0
-BOX, BOX_SPEC = closed_box(0.5, 1.0)
+BOX, _ = closed_box(0.5, 1.0)
 
 
 def environment(**more: str) -> dict[str, str]:
@@ -37,6 +37,13 @@ def octobake(*arguments: str | Path, timeout: float = 120) -> subprocess.Complet
     """Run the command to its end."""
     command = [*OCTOBAKE, *map(str, arguments)]
     return subprocess.run(command, env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def free_port() -> int:
+    """A port that was free a moment ago."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+        return port
 
 
 class InProcess:
@@ -160,7 +167,7 @@ def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
 
 
 def box_spec(samples: int = 16, probes: tuple[int, int, int] = (2, 2, 2), **more: Any) -> dict[str, Any]:
-    """Work of a known size: exactly so many samples at so many probes."""
-    spec: dict[str, Any] = json.loads(json.dumps(BOX_SPEC))
-    spec["volumes"] = [{"fit": "scene", "counts": list(probes)}]
-    return {**spec, "stop": {"target_error": None, "max_samples": samples}, **more}
+    """Work of a known size: exactly so many samples at so many probes, all of them inside the box."""
+    spacing = [1.7 / (n - 1) for n in probes]
+    grid = {"origin": [-0.86, -0.85, -0.84], "spacing": spacing, "counts": list(probes)}
+    return {"volumes": [grid], "stop": {"target_error": None, "max_samples": samples}, **more}

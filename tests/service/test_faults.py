@@ -19,11 +19,11 @@ import psutil
 import pytest
 from octobake_client import Bake, Client
 
-from tests.service.running import BOX, Server, box_spec, living, octobake, wait_for
+from tests.service.running import BOX, Server, box_spec, free_port, living, octobake, wait_for
 
 # Some 5 s of work for two cores, half of it in the last pass: long enough to be interrupted in the middle.
-SAMPLES = 256
-SPEC = box_spec(samples=SAMPLES, probes=(6, 5, 4))
+SAMPLES = 128
+SPEC = box_spec(samples=SAMPLES, probes=(5, 4, 4))
 # Much is committed by then.
 SHORT_SHARDS = ("--shard-seconds", "0.2")
 # Interrupted by every test that uses it.
@@ -89,6 +89,17 @@ def test_a_cancel_frees_the_cpu_within_a_second(server: Server, box: Path) -> No
         client.wait(submit(client, box, box_spec())).check()
 
 
+def test_nothing_listens_but_on_loopback(server: Server) -> None:
+    listening = [
+        connection.laddr.ip
+        for process in (psutil.Process(server.process.pid), *server.workers())
+        for connection in process.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+    assert len(listening) >= 2
+    assert set(listening) == {"127.0.0.1"}
+
+
 def test_two_services_do_not_share_a_data_folder(server: Server) -> None:
     second = octobake("serve", "--port", "0", "--data", server.data)
     assert second.returncode == 3
@@ -109,16 +120,17 @@ def test_an_interrupted_upload_leaves_nothing(server: Server) -> None:
 def test_a_piece_that_always_kills_its_worker_fails_and_does_not_take_the_queue_with_it(server: Server, box: Path) -> None:
     with server.client() as client:
         job, other = submit(client, box, ENDLESS), submit(client, box, box_spec())
-        last = 0
-        for _ in range(3):
-            events = client.events(job, last)
-            # Tracing again: what it told before the last kill was told before the retry event.
-            last = next(e.id or 0 for e in events if (e.type == "state" and e.document["state"] == "running") or e.type == "retry")
-            next(e for e in events if e.type == "progress" and e.document["fraction"] > 0.02)
+        events = client.events(job)
+        # The stream ends when the job has failed.
+        while next((e for e in events if e.type == "progress" and e.document["fraction"] > 0.02), None):
             server.bake_worker().kill()
-        failed = client.wait(job)
+            killed = time.monotonic()
+            # A kill between two pieces loses none: work goes on, and it is tried again.
+            next((e for e in events if e.type == "retry" or (e.type == "progress" and time.monotonic() - killed > 8)), None)
+        failed = client.bake(job.id)
         assert failed.error
-        assert (failed.state, failed.error["slug"], failed.attempts) == ("failed", "bake.crashed", 3)
+        assert (failed.state, failed.error["slug"]) == ("failed", "bake.crashed")
+        assert failed.attempts >= 3
         assert client.wait(other).check().attempts == 0, "nobody else is blamed"
 
 
@@ -140,11 +152,20 @@ def test_a_killed_worker_s_shard_is_run_again(make_server: Make, box: Path, tmp_
 
 
 def test_a_job_survives_the_kill_of_its_service(make_server: Make, box: Path, tmp_path: Path, expected: dict[str, str]) -> None:
-    server = make_server("data", *SHORT_SHARDS)
+    # The same port again, so that a client that waits finds the service when it is back.
+    server = make_server("data", *SHORT_SHARDS, "--port", str(free_port()))
+    waited: list[Bake] = []
     with server.client() as client:
         running, queued = submit(client, box), submit(client, box, box_spec())
         before = until_the_last_pass(client, running)
         assert before.state == "running"
+
+    def wait() -> None:
+        with Client(server.url, patience=60) as patient:
+            waited.append(patient.wait(running))
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
     server.kill()
     began = time.monotonic()
     assert not living(server.family, 3), "a killed service leaves no processes behind"
@@ -152,7 +173,8 @@ def test_a_job_survives_the_kill_of_its_service(make_server: Make, box: Path, tm
 
     server.start()
     with server.client() as client:
-        after = client.wait(client.bake(running.id)).check()
+        waiting.join(60)
+        after = waited[0].check()
         assert contents(client.fetch(after, tmp_path / "a.zip")) == expected
         assert after.curve[: len(before.curve)] == before.curve, "what was committed is not done again"
         client.wait(client.bake(queued.id)).check()

@@ -189,9 +189,13 @@ class Client:
             answer = self._http.request(method, url, **arguments)
         except httpx.TransportError as e:
             raise Unreachable(str(self._http.base_url.join(url)), _reason(e)) from None
-        if not answer.is_success and not (missing and answer.status_code == 404):
-            raise ServiceError.of(answer)
-        return answer
+        if answer.is_success or (missing and answer.status_code == 404):
+            return answer
+        if method == "HEAD":
+            # An answer to HEAD has no body to say why: ask again for one that has, and for no more than a byte should it be there now.
+            self._send("GET", url, headers={"Range": "bytes=0-0"})
+            return self._send("HEAD", url)
+        raise ServiceError.of(answer)
 
     def _pause(self, contact: float, url: str, reason: str) -> None:
         if time.monotonic() - contact > self.patience:

@@ -1,0 +1,25 @@
+"""How Dask is set up, in the service and in the worker that it starts."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import dask
+
+_CONFIGURATION: dict[str, Any] = {
+    # A lost worker is counted in our store, per piece of work; Dask would blame the tasks that were merely queued behind it.
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    # Its sampling profiler walks the stacks of our kernels' threads for pages that nobody serves.
+    "distributed.worker.profile.enabled": False,
+    "distributed.comm.timeouts.connect": "10s",
+}
+
+
+def configure() -> None:
+    """Set Dask up in this process, before anything of it starts."""
+    dask.config.set(_CONFIGURATION)
+    # It reads its own logging settings when it is imported, which is over. Lost workers, the news it warns of, are ours to tell.
+    logging.getLogger("distributed").setLevel(logging.ERROR)

@@ -1,0 +1,45 @@
+"""``python -m service.worker_process SCHEDULER FOLDER``: the embedded worker, started and watched by :mod:`service.compute`.
+
+A worker of somebody's own cluster is Dask's own: ``dask worker --nthreads 1 --preload service.worker SCHEDULER``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import threading
+
+from distributed import Worker
+
+from service import worker as tasks
+from service.dask_configuration import configure
+
+
+def main(scheduler: str, folder: str) -> None:
+    """Work for the scheduler at this address until the service goes away."""
+    # Ctrl-C in the service's terminal, and a service manager's SIGTERM to the whole group, are the service's to act on: a worker that
+    # went by itself would be taken for lost.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_service, daemon=True).start()
+    configure()
+    asyncio.run(_work(scheduler, folder))
+
+
+def _end_with_the_service() -> None:
+    """Go when the service has gone, however it went: its end of our standard input closes with it, even on kill -9."""
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
+async def _work(scheduler: str, folder: str) -> None:
+    async with Worker(scheduler, nthreads=1, host="127.0.0.1", dashboard=False, memory_limit=0, local_directory=folder) as worker:
+        await worker.finished()
+
+
+if __name__ == "__main__":
+    # Imported here although the scheduler would name it: the first task does not wait for it.
+    assert tasks
+    main(*sys.argv[1:])
