@@ -4,7 +4,7 @@ Kajiya 1986, "The Rendering Equation"; next-event estimation and multiple import
 Methods for Light Transport Simulation" (balance heuristic). Compiled strictly: no fastmath, so the same bits on every run.
 
 Arithmetic is float64 between queries (the queries themselves are float32): on scalars it costs nothing, and a hit point lies in its
-triangle's plane to 1e-16.
+triangle's plane to 1e-16. (`np.float64` widens; numba's `float` leaves a float32 as it is.)
 """
 
 from __future__ import annotations
@@ -160,15 +160,15 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     """
     item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
     triangle = t.item_first_triangle[item] + ray_bits[17]
-    b1 = max(float(ray[15]), _INSET)
-    b2 = max(float(ray[16]), _INSET)
+    b1 = max(np.float64(ray[15]), _INSET)
+    b2 = max(np.float64(ray[16]), _INSET)
     b0 = max(1.0 - b1 - b2, _INSET)
     scale = 1.0 / (b0 + b1 + b2)
     b0, b1, b2 = b0 * scale, b1 * scale, b2 * scale
     corner = t.corners[triangle]
-    ax, ay, az = float(corner[0]), float(corner[1]), float(corner[2])
-    bx, by, bz = float(corner[3]), float(corner[4]), float(corner[5])
-    cx, cy, cz = float(corner[6]), float(corner[7]), float(corner[8])
+    ax, ay, az = np.float64(corner[0]), np.float64(corner[1]), np.float64(corner[2])
+    bx, by, bz = np.float64(corner[3]), np.float64(corner[4]), np.float64(corner[5])
+    cx, cy, cz = np.float64(corner[6]), np.float64(corner[7]), np.float64(corner[8])
     ex, ey, ez = bx - ax, by - ay, bz - az
     fx, fy, fz = cx - ax, cy - ay, cz - az
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
@@ -265,7 +265,7 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
         towards the viewer, so that the emitter does not block itself.
     """
     e = t.emitters
-    i, _ = choose(e.cdf, float(w))
+    i, _ = choose(e.cdf, np.float64(w))
     b1, b2 = uniform_triangle(u, v)
     b0 = 1.0 - b1 - b2
     x = b0 * e.vertices[i, 0, 0] + b1 * e.vertices[i, 1, 0] + b2 * e.vertices[i, 2, 0]
@@ -309,7 +309,7 @@ def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-
 @kernel
 def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-def]
     """Light from one punctual or directional light, chosen by weight: Σ f cosθ E over albedo, unbiased."""
-    i, chance = choose(t.lights.cdf, float(u))
+    i, chance = choose(t.lights.cdf, np.float64(u))
     wx, wy, wz, distance, gain = toward_light(t.lights, i, p[0], p[1], p[2])
     cosine = lambert_cosine(wx, wy, wz, n)
     if gain <= 0 or cosine <= 0:
@@ -408,9 +408,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             hit_any = True
         dark += 1
         le_r, le_g, le_b = (
-            float(t.materials.emission[material, 0]),
-            float(t.materials.emission[material, 1]),
-            float(t.materials.emission[material, 2]),
+            np.float64(t.materials.emission[material, 0]),
+            np.float64(t.materials.emission[material, 1]),
+            np.float64(t.materials.emission[material, 2]),
         )
         strength = le_r + le_g + le_b
         if strength > 0:
@@ -427,9 +427,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b * gain * le_b
         if depth >= t.max_bounces:
             break
-        beta_r *= float(t.materials.albedo[material, 0]) * color[0]
-        beta_g *= float(t.materials.albedo[material, 1]) * color[1]
-        beta_b *= float(t.materials.albedo[material, 2]) * color[2]
+        beta_r *= np.float64(t.materials.albedo[material, 0]) * color[0]
+        beta_g *= np.float64(t.materials.albedo[material, 1]) * color[1]
+        beta_b *= np.float64(t.materials.albedo[material, 2]) * color[2]
         most = max(beta_r, beta_g, beta_b)
         if most <= 0:
             break

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
+import pytest
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from bake_core.capture import capture_distance
+from bake_core.embree import intersect1, new_rayhit, set_ray
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.octahedral import texel_directions
 from bake_core.scene import Scene
+from bake_core.transport import surface
 from tests.scenes import build, load
 from tests.unit.gltf_build import face_normals, world_triangles
 
@@ -105,6 +109,33 @@ def test_instances_turned_stretched_and_mirrored() -> None:
     scene = load(instances())
     assert len(scene.instance_mesh) == 30
     compare(scene, np.random.default_rng(2).uniform(-12, 12, (40, 3)))
+
+
+@numba.njit
+def _first_surface(t, ray, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def]
+    bits = ray.view(np.uint32)
+    set_ray(ray, bits, x, y, z, dx, dy, dz, np.float32(np.inf))
+    intersect1(t.handle, ray.ctypes.data, 0)
+    return surface(t, bits, ray, dx, dy, dz)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_hit_points_lie_in_the_triangle_s_plane_to_float64(scale: float) -> None:
+    """Slanted, off zero, a sliver, of any size: point and normal are as good as the float32 corners allow, no worse."""
+    corners = np.array([[0.3, 0.1, 5.2], [0.9, 0.4, 5.9], [0.31, 0.11, 5.3], [-0.1, -0.1, 4.1]], np.float32).astype(np.float64) * scale
+    w = GlbWriter()
+    w.node("t", mesh=w.mesh("t", [Part(corners, [[0, 1, 2], [0, 2, 3]], material=w.material("grey", (0.5,) * 3))]))
+    scene = load(w)
+    tracer = build(scene)  # its acceleration structure lives as long as it does
+    for triangle in scene.positions[scene.indices].astype(np.float64):
+        target = triangle.mean(0)
+        exact = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+        exact /= np.linalg.norm(exact)
+        origin = (target + exact * scale).astype(np.float32)
+        ray = (target - origin) / np.linalg.norm(target - origin)
+        point, normals, *_ = _first_surface(tracer.tables, new_rayhit(), *origin, *ray)
+        assert abs(float((np.array(point) - triangle[0]) @ exact)) < 1e-14 * scale
+        np.testing.assert_allclose(normals[:3], exact * -np.sign(ray @ exact), atol=1e-13)
 
 
 def test_the_nearest_of_all_triangles_by_brute_force() -> None:

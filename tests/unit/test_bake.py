@@ -1,0 +1,336 @@
+"""The whole bake: the same bytes however it is split, every way of stopping, nothing left where it fails."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bake_core.bake import BakeResult, Run, bake, empty_state, finish, prepare, shard_ranges, trace_shard
+from bake_core.bundle import read_bundle, read_report
+from bake_core.convergence import next_pass
+from bake_core.errors import BakeError, Cancelled, SceneError
+from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
+from bake_core.gltf.reader import load_scene
+from bake_core.gltf.writer import GlbWriter
+from bake_core.octahedral import texel_directions, with_border
+from bake_core.progress import Progress
+from bake_core.spec import parse_spec
+from bake_core.tally import State, Tally
+from tests.baking import maps
+from tests.scenes import add_square, sky
+from tests.unit.test_bundle import files
+
+Array = NDArray[Any]
+SMALL_GRID = {"name": "room", "origin": [-0.7, 0.3, -0.7], "spacing": [0.7, 0.7, 0.7], "counts": [3, 3, 3]}
+
+
+def bake_into(folder: Path, glb: bytes, spec: dict[str, Any], out: str = "out", **options: Any) -> BakeResult:
+    scene = folder / "scene.glb"
+    if not scene.exists():
+        scene.write_bytes(glb)
+    return bake(scene, parse_spec(spec), folder / out, **options)
+
+
+def small_cornell(**stop: Any) -> tuple[bytes, dict[str, Any]]:
+    glb, spec = cornell()
+    return glb, {**spec, "volumes": [SMALL_GRID], "stop": {"target_error": None, "max_samples": 20, **stop}}
+
+
+def test_the_same_bytes_for_any_threads_shards_and_packing(tmp_path: Path) -> None:
+    """Two volumes, all outputs, a pass that ends short: the manifest and every file that it names."""
+    glb, spec = small_cornell()
+    second = {"name": "low", "origin": [-0.5, 0.1, -0.5], "spacing": [1, 1, 1], "counts": [2, 1, 2]}
+    small = {"distance": 16, "normal": 8, "visibility": 8}
+    spec |= {
+        "volumes": [SMALL_GRID, second],
+        "outputs": ["normal", "distance", "radiance", "visibility", "irradiance"],
+        "resolution": small,
+    }
+    made = []
+    for threads, shards, out in ((1, 1, "a"), (2, 1, "b"), (1, 3, "c"), (2, 3, "d.zip"), (3, 1000, "e")):
+        bake_into(tmp_path, glb, spec, out, threads=threads, shards=shards)
+        made.append(files(tmp_path / out))
+        read_bundle(tmp_path / out)
+    assert len(made[0]) == 1 + 2 * 6 + 4
+    for other in made[1:]:
+        assert other.keys() == made[0].keys()
+        assert [name for name in other if other[name] != made[0][name]] == []
+
+
+def test_a_bake_in_steps_through_bytes_is_the_same_bake(tmp_path: Path) -> None:
+    """As the service does it: shards anywhere, in any order, tallies and state stored between passes."""
+    glb, spec = small_cornell()
+    bake_into(tmp_path, glb, spec, "whole")
+    prepared = prepare(load_scene(tmp_path / "scene.glb"), parse_spec(spec))
+    stored, samples = empty_state(prepared).to_bytes(), 0
+    while samples < 20:
+        state = State.from_bytes(stored)
+        run = next_pass(prepared.spec.stop, samples)
+        elsewhere = prepare(load_scene(tmp_path / "scene.glb"), parse_spec(spec))  # another worker
+        tallies = [trace_shard(elsewhere, r, run, threads=1).to_bytes() for r in reversed(shard_ranges(27, 4))]
+        state.add([Tally.from_bytes(t) for t in tallies])
+        stored, samples = state.to_bytes(), state.samples
+    finish(prepared, State.from_bytes(stored), Run(threads=1, shards=4, stopped="samples"), tmp_path / "steps")
+    assert files(tmp_path / "steps") == files(tmp_path / "whole")
+
+
+def test_another_seed_is_another_bundle(tmp_path: Path) -> None:
+    glb, spec = small_cornell(max_samples=4)
+    a, b = (bake_into(tmp_path, glb, {**spec, "seed": seed}, f"s{seed}").manifest for seed in (0, 1))
+    assert a["files"]["room.irradiance.exr"] != b["files"]["room.irradiance.exr"]
+    assert a["files"]["room.visibility.exr"] == b["files"]["room.visibility.exr"]
+
+
+@pytest.mark.parametrize(("probes", "shards"), list(product([1, 2, 7, 1000], [1, 2, 3, 7, 2000])))
+def test_shards_cover_all_probes_evenly(probes: int, shards: int) -> None:
+    ranges = shard_ranges(probes, shards)
+    assert ranges[0][0] == 0 and ranges[-1][1] == probes and all(a[1] == b[0] for a, b in pairwise(ranges))
+    sizes = [b - a for a, b in ranges]
+    assert len(ranges) == min(probes, shards) and max(sizes) - min(sizes) <= 1 and min(sizes) > 0
+
+
+# --- stopping ------------------------------------------------------------------------------------------------------------------------
+
+
+def test_stops_at_the_target(tmp_path: Path) -> None:
+    glb, spec = small_cornell(target_error=0.2, max_samples=4096)
+    result = bake_into(tmp_path, glb, spec)
+    assert result.met and result.manifest["stopped"] == "target" == result.run.stopped
+    assert result.manifest["samples"] < 4096
+    assert result.manifest["error"]["value"] <= 0.2 and result.manifest["error"]["target"] == 0.2
+
+
+def test_out_of_samples_before_the_target(tmp_path: Path) -> None:
+    glb, spec = small_cornell(target_error=1e-6, max_samples=32)
+    result = bake_into(tmp_path, glb, spec)
+    assert not result.met and result.manifest["stopped"] == "samples" and result.manifest["samples"] == 32
+    assert result.manifest["error"]["value"] > 1e-6
+    read_bundle(tmp_path / "out")
+
+
+def test_no_target_is_always_met(tmp_path: Path) -> None:
+    glb, spec = small_cornell(max_samples=4)
+    assert bake_into(tmp_path, glb, spec).met
+
+
+def test_out_of_time(tmp_path: Path) -> None:
+    glb, spec = closed_box(0.99, 1.0)
+    bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 1}}, "warm")
+    limited = {**spec, "stop": {"target_error": 1e-9, "max_seconds": 1.5, "max_samples": 1 << 24}}
+    result = bake_into(tmp_path, glb, limited)
+    # The first pass is always whole; after it, passes are cut to what is left.
+    assert result.run.curve[-1].seconds < 1.5 * max(1.5, result.run.curve[0].seconds) + 1
+    assert result.manifest["stopped"] == "time" and not result.met
+    assert result.manifest["samples"] >= 16 and result.manifest["samples"] % 4 == 0
+    assert result.manifest["samples"] == result.run.curve[-1].samples
+    read_bundle(tmp_path / "out")
+
+
+def test_the_curve_has_a_point_for_each_doubling_and_errors_fall(tmp_path: Path) -> None:
+    glb, spec = small_cornell(max_samples=256)
+    result = bake_into(tmp_path, glb, spec)
+    assert [p.samples for p in result.run.curve] == [16, 32, 64, 128, 256]
+    assert all(a.seconds < b.seconds for a, b in pairwise(result.run.curve))
+    errors = [p.error for p in result.run.curve]
+    assert errors[0] > 2 * errors[-1] > 0  # type: ignore[operator]
+    assert result.manifest["error"] == {"value": errors[-1], "target": None, "scrambles": 4}
+    report = read_report(tmp_path / "out")
+    assert report is not None
+    assert report["curve"] == [{"samples": p.samples, "seconds": p.seconds, "error": p.error} for p in result.run.curve]
+    assert set(report["stages"]) == {"reading", "building", "compiling", "tracing", "writing"}
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_with_fewer_samples_than_scrambles_the_error_is_null(tmp_path: Path, samples: int) -> None:
+    glb, spec = small_cornell(max_samples=samples, target_error=0.5)
+    result = bake_into(tmp_path, glb, spec)
+    assert result.manifest["error"]["value"] is None and result.run.curve[-1].error is None
+    assert result.manifest["stopped"] == "samples" and not result.met
+    assert "–" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_error_figure_is_no_smaller_than_the_error(tmp_path: Path) -> None:
+    """Against a bake of 16 times the samples, on the Cornell box: what is claimed holds, and is no empty claim."""
+    glb, spec = small_cornell()
+    few = bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 32}, "seed": 1}, "few")
+    bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 512}, "seed": 2}, "many", threads=2)
+    a, b = maps(read_bundle(tmp_path / "few")), maps(read_bundle(tmp_path / "many"))
+    square = (b**2).sum(-1)
+    error = np.sqrt((((a - b) ** 2).sum(-1) / (square + (0.05 * np.sqrt(square).mean()) ** 2)).mean())
+    claimed = few.manifest["error"]["value"]
+    assert error < claimed < 2 * error
+
+
+# --- cancelling, failing --------------------------------------------------------------------------------------------------------------
+
+
+def test_cancelling_ends_within_half_a_second_and_leaves_nothing(tmp_path: Path) -> None:
+    glb, spec = closed_box(0.99, 1.0)
+    flag = np.zeros(1, np.uint8)
+    cancelled_at: list[float] = []
+
+    def cancel() -> None:
+        cancelled_at.append(time.perf_counter())
+        flag.fill(1)
+
+    timer = threading.Timer(0.3, cancel)
+
+    def watch(progress: Progress) -> None:
+        if progress.stage == "tracing" and not timer.is_alive() and not cancelled_at:
+            timer.start()
+
+    endless = {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}}
+    with pytest.raises(Cancelled):
+        bake_into(tmp_path, glb, endless, progress=watch, cancelled=flag, threads=2)
+    assert time.perf_counter() - cancelled_at[0] < 0.5
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]
+
+
+def test_what_cannot_be_stored_is_an_error_and_never_an_infinity(tmp_path: Path) -> None:
+    """Close to a square of radiance 2e38 irradiance is 6e38: more than float32 holds."""
+    w = GlbWriter()
+    add_square(w, "sun", (0.9,) * 3, emission=(2e38,) * 3, double_sided=True)
+    spec = {
+        "volumes": [{"origin": [0, 0.01, 0], "spacing": [1, 1, 1], "counts": [1, 1, 1]}],
+        "stop": {"target_error": None, "max_samples": 4},
+    }
+    with pytest.raises(BakeError) as caught:
+        bake_into(tmp_path, w.to_glb(), spec)
+    assert caught.value.slug == "bake.not_finite" and "v0" in caught.value.where
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]
+
+
+def test_bright_light_is_stored_in_full(tmp_path: Path) -> None:
+    glb, spec = closed_box(0.5, 50_000.0)
+    manifest = bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 16}}).manifest
+    (irradiance, _) = manifest["volumes"][0]["atlases"]
+    assert irradiance["encoding"] == "float"
+    assert maps(read_bundle(tmp_path / "out")).mean() == pytest.approx(np.pi * 100_000, rel=0.01)
+
+
+def test_a_bad_scene_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SceneError):
+        bake_into(tmp_path, b"not a scene", closed_box(0.5, 1.0)[1])
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]
+
+
+# --- progress ------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_progress_never_falls_and_goes_through_all_stages(tmp_path: Path, shards: int) -> None:
+    told: list[Progress] = []
+    glb, spec = small_cornell(max_samples=64, target_error=0.05)
+    bake_into(tmp_path, glb, spec, progress=told.append, shards=shards, threads=2)
+    assert all(a.fraction <= b.fraction for a, b in pairwise(told))
+    assert all(0 <= p.fraction <= 1 for p in told) and told[-1].fraction >= 0.97
+    stages = [p.stage for p in told]
+    assert list(dict.fromkeys(stages)) == ["reading", "building", "compiling", "tracing", "writing"]
+    assert all(a.seconds <= b.seconds for a, b in pairwise(told))
+    measured = [p for p in told if p.error is not None]
+    assert measured and measured[0].samples == 16
+
+
+# --- what is baked --------------------------------------------------------------------------------------------------------------------
+
+
+def test_all_outputs(tmp_path: Path) -> None:
+    """A square 1 m to both sides of a probe: distances and normals by geometry, misses where there is nothing, radiance 1 or 0."""
+    glb, spec = square_emitter()
+    everything = ["irradiance", "visibility", "radiance", "distance", "normal"]
+    small = {"radiance": 16, "distance": 32, "normal": 16, "visibility": 8, "irradiance": 4}
+    result = bake_into(
+        tmp_path, glb, {**spec, "outputs": everything, "resolution": small, "stop": {"target_error": None, "max_samples": 16}}
+    )
+    bundle = read_bundle(tmp_path / "out")
+    assert list(bundle.volumes[0].atlases) == everything and result.manifest["left_out"] == []
+    described = {a["output"]: a for a in result.manifest["volumes"][0]["atlases"]}
+    assert [described[o]["interior"] for o in everything] == [4, 8, 16, 32, 16]
+    d = texel_directions(32)
+    x, y, z = np.abs(np.moveaxis(d, -1, 0))
+    hit = np.maximum(y, z) < x / 2
+    distance = maps(bundle, "distance")[0, :, :, 0]
+    np.testing.assert_allclose(distance[hit], 1 / x[hit], rtol=1e-4)
+    miss = described["distance"]["miss"]
+    assert (distance[~hit] == miss).all() and 4 * np.sqrt(6) <= miss < 8 * np.sqrt(6)
+    d = texel_directions(16)
+    x, y, z = np.abs(np.moveaxis(d, -1, 0))
+    hit = np.maximum(y, z) < x / 2
+    normal = maps(bundle, "normal")[0]
+    assert not normal[~hit].any()
+    np.testing.assert_allclose(normal[hit][:, 0], -np.sign(d[hit][:, 0]), atol=1e-3)
+    radiance = maps(bundle, "radiance")[0]
+    assert set(np.unique(radiance)) >= {0.0, 1.0} and radiance.max() == 1
+    # Every tile has its border.
+    for output, atlas in bundle.volumes[0].atlases.items():
+        interior = maps(bundle, output).astype(np.float32)
+        np.testing.assert_array_equal(atlas.texels.reshape(1, atlas.tile, atlas.tile, -1), with_border(interior))
+
+
+def test_one_output_alone(tmp_path: Path) -> None:
+    glb, spec = square_emitter()
+    for output in ("irradiance", "visibility", "radiance", "distance", "normal"):
+        chosen = {**spec, "outputs": [output], "stop": {"target_error": None, "max_samples": 4}}
+        manifest = bake_into(tmp_path, glb, chosen, output).manifest
+        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output]
+        assert {x["what"] for x in manifest["left_out"]} == {"irradiance", "visibility", "radiance", "distance", "normal"} - {output}
+
+
+def test_probes_inside_geometry_are_inactive(tmp_path: Path) -> None:
+    """A closed box seen from outside by one probe, and a probe within it that sees the backs of its walls."""
+    from trimesh.creation import box
+
+    from bake_core.gltf.writer import Part
+
+    mesh = box((1, 1, 1))
+    w = GlbWriter()
+    part = Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material=w.material("grey", (0.5,) * 3))
+    w.node("box", mesh=w.mesh("box", [part]))
+    spec = {
+        "volumes": [{"origin": [0.1, 0.1, 0.1], "spacing": [2, 2, 2], "counts": [2, 1, 1]}],
+        "environment": sky(),
+        "stop": {"target_error": None, "max_samples": 16},
+    }
+    probes = bake_into(tmp_path, w.to_glb(), spec).manifest["volumes"][0]["probes"]
+    assert probes["states"] == [0, 1] and probes["active"] == 1
+    assert probes["backface"] == [1, 0]
+    volume = read_bundle(tmp_path / "out").volumes[0]
+    assert volume.states.tolist() == [0, 1] and not maps(read_bundle(tmp_path / "out"))[0].any()
+
+
+def test_several_volumes_are_baked_each_by_itself(tmp_path: Path) -> None:
+    """The second volume's bake depends on its probes' numbers only: it is found in the first bake's files."""
+    glb, spec = plane_under_sun()
+    grids = [{"name": n, "origin": [x, 1, 0], "spacing": [1, 1, 1], "counts": [2, 1, 1]} for n, x in (("a", 0.0), ("b", 50.0))]
+    bake_into(tmp_path, glb, {**spec, "volumes": grids, "stop": {"target_error": None, "max_samples": 16}})
+    bundle = read_bundle(tmp_path / "out")
+    assert [v.name for v in bundle.volumes] == ["a", "b"]
+    down = [maps(bundle, volume=i).max((1, 2, 3)) for i in (0, 1)]
+    np.testing.assert_allclose(down, 0.5 * 3 * 0.8, rtol=0.06)
+
+
+def test_nothing_but_sky(tmp_path: Path) -> None:
+    w = GlbWriter()
+    w.node("empty")
+    grid = {"origin": [0, 0, 0], "spacing": [1, 1, 1], "counts": [1, 2, 1]}
+    bake_into(tmp_path, w.to_glb(), {"volumes": [grid], "environment": sky(2.0)})
+    bundle = read_bundle(tmp_path / "out")
+    np.testing.assert_allclose(maps(bundle), 2 * np.pi, rtol=1e-3)
+    assert bundle.manifest["error"]["value"] < 1e-9 and bundle.manifest["stopped"] == "target"
+    moments = maps(bundle, "visibility")
+    np.testing.assert_allclose(moments[..., 0], bundle.volumes[0].distance_limit, rtol=1e-6)
+
+
+def test_black_is_exactly_black(tmp_path: Path) -> None:
+    glb, spec = closed_box(0.9, 0.0)
+    lit_outside = {"lights": [{"kind": "directional", "direction": [0, -1, 0], "irradiance": [1e9] * 3}], "environment": sky(1e9)}
+    result = bake_into(tmp_path, glb, {**spec, **lit_outside, "stop": {"max_samples": 64}})
+    assert not maps(read_bundle(tmp_path / "out")).any()
+    assert result.manifest["error"]["value"] == 0 and result.met
