@@ -1,0 +1,95 @@
+"""What will be kept, left out and spent, before it is: selection, plan, and the clock's guesses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bake_core.bake import bake
+from bake_core.clock import expected_samples
+from bake_core.errors import SpecError
+from bake_core.examples import closed_box, cornell
+from bake_core.gltf.writer import GlbWriter
+from bake_core.images import read_exr
+from bake_core.plan import plan
+from bake_core.selection import select
+from bake_core.spec import OUTPUTS, Stop, parse_spec
+from tests.scenes import ONE_PROBE, add_square, load, square_scene
+from tests.unit.test_transport import load_example
+
+
+def spec(**changes: Any) -> Any:
+    return parse_spec({"volumes": [ONE_PROBE], **changes})
+
+
+@pytest.mark.parametrize(("material", "glossy"), [({}, False), ({"metallic": 1.0}, True), ({"roughness": 0.5}, True)])
+def test_single_directions_are_kept_where_something_reflects_them(material: dict[str, float], glossy: bool) -> None:
+    chosen = select(square_scene(**material), spec())
+    assert chosen.outputs == (OUTPUTS if glossy else ("irradiance", "visibility"))
+    assert chosen.capture == (64 if glossy else 16)
+    assert {what for what, _ in chosen.left_out} == set(OUTPUTS) - set(chosen.outputs)
+    assert all(why for _, why in chosen.left_out)
+
+
+def test_a_material_that_nothing_uses_does_not_count() -> None:
+    w = GlbWriter()
+    add_square(w)
+    w.material("spare", metallic=1.0, roughness=0.1)
+    assert select(load(w), spec()).outputs == ("irradiance", "visibility")
+
+
+def test_what_the_spec_demands_goes_first() -> None:
+    chosen = select(square_scene(), spec(outputs=["normal", "irradiance"], resolution={"radiance": 32, "normal": 8}))
+    assert chosen.outputs == ("irradiance", "normal") and (chosen.capture, chosen.normal) == (32, 8)
+    assert chosen.keeps("normal") and not chosen.keeps("visibility")
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_miss_is_longer_than_any_hit_and_says_that_it_is_none(size: float) -> None:
+    w = GlbWriter()
+    part_matrix = np.diag([size, size, size, 1.0])
+    add_square(w, matrix=part_matrix)
+    miss = select(load(w), spec()).miss_distance
+    assert 4 * 2**0.5 * size * 0.999 <= miss <= 8 * 2**0.5 * size * 1.001
+    assert float(miss).hex().startswith("0x1.0000000000000p")
+
+
+def test_a_plan_says_what_the_bake_then_does(tmp_path: Path) -> None:
+    glb, document = closed_box(0.5, 1.0)
+    wanted = parse_spec({**document, "stop": {"target_error": None, "max_samples": 4}})
+    made = plan(load_example(glb), wanted, threads=1)
+    (tmp_path / "scene.glb").write_bytes(glb)
+    manifest = bake(tmp_path / "scene.glb", wanted, tmp_path / "out").manifest
+    (volume,) = manifest["volumes"]
+    assert (list(made.volumes[0].origin), list(made.volumes[0].counts)) == (volume["origin"], volume["counts"])
+    assert made.probes == 8 and list(made.outputs) == [a["output"] for a in volume["atlases"]]
+    assert [{"what": what, "why": why} for what, why in made.left_out] == manifest["left_out"]
+    stored = 0
+    for atlas in volume["atlases"]:
+        pixels, half = read_exr(tmp_path / "out" / atlas["file"], SpecError, "")
+        stored += pixels.size * (2 if half else 4)
+    assert made.atlas_bytes == stored
+    assert made.paths_per_second > 1e4 and made.memory_bytes > made.atlas_bytes
+    assert made.seconds == pytest.approx(8 * 256 * 4 / made.paths_per_second)
+
+
+def test_a_plan_refuses_what_a_bake_refuses() -> None:
+    with pytest.raises(SpecError):
+        plan(load_example(cornell()[0]), spec(environment={"kind": "equirect", "image": "sky.exr"}), threads=1)
+
+
+@pytest.mark.parametrize(
+    ("stop", "samples", "error", "expected"),
+    [
+        (Stop(target_error=0.02), 16, 0.01, 16),
+        (Stop(target_error=0.02), 16, 0.04, 64),  # the error falls as the square root at the least
+        (Stop(target_error=0.02), 16, 4.0, 256),
+        (Stop(target_error=None), 16, 0.01, 256),
+        (Stop(target_error=0.02), 16, None, 256),
+    ],
+)
+def test_guesses_of_how_long_it_takes(stop: Stop, samples: int, error: float | None, expected: int) -> None:
+    assert expected_samples(stop, samples, error) == expected
