@@ -93,17 +93,28 @@ def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
 
 
 def empty_state(prepared: Prepared) -> State:
-    """The state before the first pass."""
+    """The state before the first pass.
+
+    Raises
+    ------
+    MachineError
+        ``machine.no_memory``.
+    """
     n, s = prepared.probe_count, prepared.selection
-    return State(
-        samples=0,
-        irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3)),
-        radiance=np.zeros((n, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0)),
-        visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
-        backface=np.zeros(n, np.float32),
-        distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
-        normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
-    )
+    try:
+        return State(
+            samples=0,
+            irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3)),
+            radiance=np.zeros((n, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0)),
+            visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
+            backface=np.zeros(n, np.float32),
+            distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
+            normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
+        )
+    except MemoryError:
+        raise MachineError(
+            "machine.no_memory", f"the sums of {n} probes do not fit; bake fewer probes or texels at a time", "volumes"
+        ) from None
 
 
 def trace_shard(

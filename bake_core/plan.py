@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,7 +60,8 @@ def plan(scene: Scene, spec: Spec, *, threads: int) -> Plan:
     prepared = prepare(scene, spec)
     n, s = prepared.probe_count, prepared.selection
     speed = _paths_per_second(prepared, threads)
-    state_bytes = sum(a.nbytes for a in vars(empty_state(prepared)).values() if isinstance(a, np.ndarray))
+    one = empty_state(replace(prepared, positions=prepared.positions[:1]))
+    state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
     texels = {
         "irradiance": (s.irradiance, 6),
         "visibility": (s.visibility, 8),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
-from bake_core.bake import bake
+from bake_core.bake import bake, empty_state, prepare
 from bake_core.clock import expected_samples
-from bake_core.errors import SpecError
+from bake_core.errors import MachineError, SpecError
 from bake_core.examples import closed_box, cornell
 from bake_core.gltf.writer import GlbWriter
 from bake_core.images import read_exr
@@ -74,6 +76,22 @@ def test_a_plan_says_what_the_bake_then_does(tmp_path: Path) -> None:
     assert made.atlas_bytes == stored
     assert made.paths_per_second > 1e4 and made.memory_bytes > made.atlas_bytes
     assert made.seconds == pytest.approx(8 * 256 * 4 / made.paths_per_second)
+
+
+def test_a_large_grid_is_planned_without_its_sums_and_refused_by_name_where_they_do_not_fit() -> None:
+    """A million probes are 6 GB of sums: a figure in the plan, an error with a slug where a bake begins."""
+    large = parse_spec({"volumes": [{"fit": "scene", "counts": [128, 128, 64]}]})
+    scene = load_example(closed_box(0.5, 1.0)[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + (2 << 30), hard))
+    try:
+        made = plan(scene, large, threads=1)
+        with pytest.raises(MachineError) as caught:
+            empty_state(prepare(scene, large))
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert made.memory_bytes > 2 * 2**20 * 4 * 64 * 3 * 8
+    assert caught.value.slug == "machine.no_memory"
 
 
 def test_a_plan_refuses_what_a_bake_refuses() -> None:
