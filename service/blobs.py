@@ -136,6 +136,11 @@ class Blobs:
         for batch in obstore.list(self._store, work_key(job, "")):
             obstore.delete(self._store, [entry["path"] for entry in batch])
 
+    def jobs_with_work(self) -> set[str]:
+        """The jobs that have a work folder."""
+        found = obstore.list_with_delimiter(self._store, "work")
+        return {prefix.removeprefix("work/").strip("/") for prefix in found["common_prefixes"]}
+
     def local_path(self, digest: str) -> Path:
         """A local file with a blob's bytes; fetched into the scratch folder first where the store is elsewhere."""
         path = self._local / blob_key(digest)

@@ -9,6 +9,7 @@ from service.blobs import Blobs
 from service.compute import Compute, Message
 from service.driver import Driver
 from service.hub import Hub
+from service.jobs import FINISHED
 from service.settings import Settings
 from service.store import Store
 
@@ -36,8 +37,12 @@ class Scheduler:
         self._thread = threading.Thread(target=self._loop, name="octobake-scheduler", daemon=True)
 
     def start(self) -> None:
-        """Queue again what an earlier life left half done, and begin. Does not wait for the workers."""
+        """Queue again what an earlier life left half done, sweep away what is of no more use, and begin. Does not wait for the workers."""
         self._store.reconcile()
+        for job in self._blobs.jobs_with_work():
+            found = self._store.job(job)
+            if found is None or found.state in FINISHED:
+                self._blobs.remove_work(job)
         self._thread.start()
 
     @property

@@ -88,6 +88,9 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
     def cancel_job(id: str, service: Here) -> Document:
         find(service, kind, id)
         job = service.store.cancel(id)
+        if job.state == State.CANCELLED:
+            # It was queued; a restart may have put it there with a part of its work done.
+            service.blobs.remove_work(id)
         service.hub.tell(id)
         service.scheduler.cancel(id)
         return document(service, job, False)

@@ -174,7 +174,7 @@ def test_a_cornell_box_is_baked_through_the_service_and_its_picture_holds(server
         assert bake.result["error"] <= bake.spec["stop"]["target_error"]
         assert bake.curve[-1].error == bake.result["error"]
         progress: list[float] = []
-        verification = client.verify(bake, width=320, height=180, samples=64)
+        verification = client.verify(bake, width=256, height=144, samples=32)
         verification = client.wait(verification, lambda p: progress.append(p.fraction)).check()
         assert verification.result
         report = verification.result["report"]
