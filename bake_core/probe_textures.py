@@ -1,33 +1,31 @@
-"""A bundle's volumes on a Vulkan device: their textures, and the reference GLSL module bound to them."""
+"""A bundle's volumes on a Vulkan device: three textures for all of them, and the reference GLSL module bound to these.
+
+Devices bind few samplers at a time, so the volumes lie in one array texture an output, layers after layers; each is put into the
+lower corner of a layer as large as the largest needs.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bake_core.bundle import VolumeData
 from bake_core.shader_compiler import module_source
 from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.vulkan import Device, Image, texture
 
-# Textures of one volume, in the order of their bindings: the macro that reads it, its GLSL type, its swizzle.
-_TEXTURES = (("OB_IRRADIANCE", "vec3", ".rgb"), ("OB_VISIBILITY", "vec2", ".rg"), ("OB_PROBE", "vec4", ""))
+F32 = NDArray[np.float32]
 
 
 def probe_textures(device: Device, volumes: Sequence[VolumeData]) -> list[Image]:
-    """Three textures a volume: irradiance, visibility (one texel where the bundle has none) and the probe table."""
-    out = []
-    for volume in volumes:
-        rgb = volume.atlases["irradiance"].texels
-        # No device need offer textures of three channels.
-        rgba = np.concatenate([rgb, np.zeros((*rgb.shape[:3], 1), np.float32)], -1)
-        visibility = volume.atlases.get("visibility")
-        moments = np.zeros((1, 1, 1, 2), np.float32) if visibility is None else visibility.texels
-        out += [texture(device, rgba, linear=True), texture(device, moments, linear=True)]
-        out.append(texture(device, probe_texels(volume), linear=False))
-    return out
+    """Irradiance, visibility and the probe tables of all volumes."""
+    irradiance, visibility, probes = _texels(volumes)
+    # No device need offer textures of three channels.
+    rgba = [np.concatenate([t, np.zeros((*t.shape[:3], 1), np.float32)], -1) for t in irradiance]
+    stacks = (_stacked(rgba), _stacked(visibility), _stacked(probes))
+    return [texture(device, stack, linear=linear) for stack, linear in zip(stacks, (True, True, False), strict=True)]
 
 
 def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: ArrayLike = (0.0, 0.0, 0.0)) -> str:
@@ -40,15 +38,37 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
     frame : (3,) float
         World position of the zero of the shader's frame, metres.
     """
+    first = np.cumsum([0] + [v.atlases["irradiance"].layers for v in volumes]).tolist()
     lines = []
-    for v in range(len(volumes)):
-        for t, (macro, _, _) in enumerate(_TEXTURES):
-            lines.append(f"layout(set = 0, binding = {first_binding + 3 * v + t}) uniform sampler2DArray {macro.lower()}_{v};")
-    for macro, kind, swizzle in _TEXTURES:
-        look_up, where = ("texelFetch({}, p, 0)", "ivec3") if macro == "OB_PROBE" else ("textureLod({}, p, 0.0)" + swizzle, "vec3")
-        # A sampler may not be chosen by an index that differs between neighbours, so the choice is a chain of branches.
-        chain = "".join(f"v == {v} ? {look_up.format(f'{macro.lower()}_{v}')} : " for v in range(len(volumes) - 1))
-        last = look_up.format(f"{macro.lower()}_{len(volumes) - 1}")
-        lines.append(f"{kind} {macro.lower()}(int v, {where} p) {{ return {chain}{last}; }}")
-        lines.append(f"#define {macro}(v, p) {macro.lower()}(v, p)")
+    for i, (name, texels) in enumerate(zip(("Irradiance", "Visibility", "Probes"), _texels(volumes), strict=True)):
+        height, width = (max(t.shape[axis] for t in texels) for axis in (1, 2))
+        lines.append(f"layout(set = 0, binding = {first_binding + i}) uniform sampler2DArray host{name};")
+        # How far a volume's layers reach across the texture's, and which is its first.
+        places = [f"vec3({t.shape[2] / width!r}, {t.shape[1] / height!r}, {layer}.0)" for t, layer in zip(texels, first, strict=False)]
+        choices = "".join(f" if (v == {v}) place = {place};" for v, place in enumerate(places) if v)
+        lines.append(f"vec3 place{name}(int v) {{ vec3 place = {places[0]};{choices} return place; }}")
+    for name, kind, swizzle in (("Irradiance", "vec3", "rgb"), ("Visibility", "vec2", "rg")):
+        look_up = f"textureLod(host{name}, vec3(p.xy * place.xy, p.z + place.z), 0.0).{swizzle}"
+        lines.append(f"{kind} read{name}(int v, vec3 p) {{ vec3 place = place{name}(v); return {look_up}; }}")
+    lines += [
+        "#define OB_IRRADIANCE(v, uvw) readIrradiance(v, uvw)",
+        "#define OB_VISIBILITY(v, uvw) readVisibility(v, uvw)",
+        "#define OB_PROBE(v, texel) texelFetch(hostProbes, texel + ivec3(0, 0, int(placeProbes(v).z)), 0)",
+    ]
     return "\n".join(lines) + "\n" + module_source(bundle_constants(volumes, frame))
+
+
+def _texels(volumes: Sequence[VolumeData]) -> tuple[list[F32], list[F32], list[F32]]:
+    """Irradiance, visibility and probe tables, one array a volume; each volume has as many layers in all three."""
+    irradiance = [v.atlases["irradiance"].texels for v in volumes]
+    probes = [probe_texels(v) for v in volumes]
+    visibility = [
+        v.atlases["visibility"].texels if "visibility" in v.atlases else np.zeros((len(p), 1, 1, 2), np.float32)
+        for v, p in zip(volumes, probes, strict=True)
+    ]
+    return irradiance, visibility, probes
+
+
+def _stacked(parts: Sequence[F32]) -> F32:
+    height, width = max(p.shape[1] for p in parts), max(p.shape[2] for p in parts)
+    return np.concatenate([np.pad(p, ((0, 0), (0, height - p.shape[1]), (0, width - p.shape[2]), (0, 0))) for p in parts])

@@ -44,7 +44,7 @@ float obCrush(float weight) {
 // Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
 // (facing times visibility, crushed) times the probe's state (1, or 0 inside geometry).
 vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo) {
-    ObVolume volume = OB_VOLUME[v];
+    ObVolume volume = obVolume(v);
     ObCell cell = obCell(volume, position);
     vec3 biased = position + normal * volume.normalBias + wo * volume.viewBias;
     vec2 octNormal = obDirToOct(normal);
@@ -73,7 +73,7 @@ int obSelectVolume(vec3 position) {
     int nearest = 0;
     float least = 3.4e38;
     for (int v = 0; v < OB_VOLUMES; ++v) {
-        float d = obDistanceSquared(OB_VOLUME[v], position);
+        float d = obDistanceSquared(obVolume(v), position);
         if (d < least) {
             least = d;
             nearest = v;

@@ -74,6 +74,9 @@ def storage(device: Device, data: NDArray[Any] | int) -> Buffer:
     """A storage buffer holding `data`, or of so many bytes; at least 16, so that nothing need be said about empty arrays."""
     raw = None if isinstance(data, int) else np.ascontiguousarray(data).reshape(-1).view(np.uint8)
     size = max(16, data if isinstance(data, int) else data.nbytes)
+    most = vk.vkGetPhysicalDeviceProperties(device.physical).limits.maxStorageBufferRange
+    if size > most:
+        raise MachineError("vulkan.buffer_too_large", f"{size} bytes in one buffer are more than {device.name} takes ({most})")
     usage = vk.VK_BUFFER_USAGE_STORAGE_BUFFER_BIT | vk.VK_BUFFER_USAGE_TRANSFER_SRC_BIT | vk.VK_BUFFER_USAGE_TRANSFER_DST_BIT
     info = vk.VkBufferCreateInfo(size=size, usage=usage, sharingMode=vk.VK_SHARING_MODE_EXCLUSIVE)
     handle = device.make(vk.vkCreateBuffer, vk.vkDestroyBuffer, info)

@@ -17,7 +17,7 @@ def test_constants_are_the_same_text_every_time_and_read_back() -> None:
     volumes = synthetic.volumes()
     text = bundle_constants(volumes)
     assert text == bundle_constants(volumes)
-    rows = re.findall(r"^    ObVolume\((.*)\),? // (.*)$", text, re.MULTILINE)
+    rows = re.findall(r"^    .*volume = ObVolume\((.*)\); // (.*)$", text, re.MULTILINE)
     assert [name for _, name in rows] == ["fine", "coarse", "flat"]
     for (row, _), volume in zip(rows, volumes, strict=True):
         numbers = [float(x) for x in re.findall(r"(?<![A-Za-z0-9])-?[0-9][0-9.e+-]*", row)]

@@ -54,7 +54,8 @@ def run(source: str, inputs: Sequence[NDArray[np.float64]], rows: int, volumes: 
     packed[..., :3] = np.stack(inputs, 1)
     with Device() as device:
         source_buffer, result = storage(device, packed), storage(device, n * rows * 16)
-        bindings = Bindings(device, [source_buffer, result, *probe_textures(device, volumes)])
+        probes = probe_textures(device, volumes) if volumes else []
+        bindings = Bindings(device, [source_buffer, result, *probes])
         pipeline = compute_pipeline(device, compile_glsl(source, "comp", "test"), bindings)
         device.run(lambda commands: commands.dispatch(pipeline, (n + 63) // 64, np.int32(n).tobytes()))
         return result.read(np.float32, (n, rows, 4))
@@ -90,6 +91,17 @@ def test_one_volume_is_enough() -> None:
     _, normals, wo = synthetic.points(50)
     found = query((volume,), normals * 0.3, normals, wo)
     expected = irradiance.sample((volume,), normals * 0.3, normals, wo)
+    np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
+
+
+def test_as_many_volumes_as_a_spec_may_have() -> None:
+    """Sixty-four, of different sizes, in a row."""
+    volumes = tuple(synthetic.volume(f"v{i}", (2.0 * i, 0, 0), (1, 1, 1), (2, 2 + i % 3, 1 + i % 2), seed=i) for i in range(64))
+    position = np.stack([np.arange(64) * 2 + 0.4, np.full(64, 0.3), np.full(64, 0.2)], -1)
+    normal = np.tile([0.0, 0.6, 0.8], (64, 1))
+    found = query(volumes, position, normal, normal)
+    expected = irradiance.sample(volumes, position, normal)
+    np.testing.assert_array_equal(found[:, 3], np.arange(64))
     np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
 
 

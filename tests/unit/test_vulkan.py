@@ -69,10 +69,13 @@ def test_what_the_validation_layers_say_is_an_error() -> None:
         assert caught.value.slug == "vulkan.validation"
 
 
-def test_an_image_larger_than_the_device_takes_is_refused() -> None:
+def test_an_image_or_a_buffer_larger_than_the_device_takes_is_refused() -> None:
     with Device() as device, pytest.raises(MachineError) as caught:
         depth_target(device, 1 << 20, 1)
     assert caught.value.slug == "vulkan.image_too_large"
+    with Device() as device, pytest.raises(MachineError) as caught:
+        storage(device, 1 << 40)
+    assert caught.value.slug == "vulkan.buffer_too_large"
 
 
 def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
