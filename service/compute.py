@@ -27,6 +27,8 @@ log = logging.getLogger("octobake.compute")
 
 # An idle scheduler closes in a third of this; a shutdown shall take less than two seconds in all.
 CLOSE_SECONDS = 0.5
+# Workers come and go; how many there are may be known this late.
+SLOTS_SECONDS = 0.5
 # A worker that ends sooner than this cannot even start: do not try again at once.
 QUICK_DEATH_SECONDS = 1.0
 # What a worker tells: {"key", "address", "began": true} … {"key", "done": 0.3} … {"key", "ended": true}.
@@ -46,6 +48,7 @@ class Compute:
     def __init__(self, settings: Settings, hear: Callable[[Message], None]) -> None:
         self._cluster: LocalCluster | None = None
         self._worker: _EmbeddedWorker | None = None
+        self._known_slots, self._asked_slots_at = 0, float("-inf")
         configure()
         try:
             if not settings.dask:
@@ -70,8 +73,11 @@ class Compute:
         return bool(self._client.status == "running") and self._slots() > 0
 
     def _slots(self) -> int:
-        slots: int = self._client.scheduler_info(n_workers=0)["total_threads"]
-        return slots
+        # Asked between any two pieces of work, and a round trip each time would show.
+        if time.monotonic() - self._asked_slots_at > SLOTS_SECONDS:
+            self._known_slots = self._client.scheduler_info(n_workers=0)["total_threads"]
+            self._asked_slots_at = time.monotonic()
+        return self._known_slots
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Run a function on a worker; every call is its own task, even with the same arguments."""

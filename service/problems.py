@@ -60,7 +60,8 @@ def install(app: FastAPI, routers: Sequence[APIRouter]) -> None:
 
     async def ours(_: Request, error: Exception) -> Response:
         assert isinstance(error, OctobakeError)
-        if error.http_status >= 500:
+        # A RequestError is an answer; what else is a server's fault is news for whoever runs it.
+        if error.http_status >= 500 and not isinstance(error, RequestError):
             log.error("%s: %s", error.slug, error)
         return problem(error.http_status, error.slug, error.message, error.where, getattr(error, "headers", None))
 

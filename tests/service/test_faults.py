@@ -7,6 +7,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import zipfile
@@ -19,7 +21,7 @@ import psutil
 import pytest
 from octobake_client import Bake, Client
 
-from tests.service.running import BOX, Server, box_spec, free_port, living, octobake, wait_for
+from tests.service.running import BOX, Server, box_spec, environment, free_port, living, octobake, wait_for
 
 # Some 5 s of work for two cores, half of it in the last pass: long enough to be interrupted in the middle.
 SAMPLES = 128
@@ -182,6 +184,47 @@ def test_a_job_survives_the_kill_of_its_service(make_server: Make, box: Path, tm
     assert states[:3] == ["queued", "preparing", "running"]
     assert states[3:] == ["queued", "preparing", "running", "finalizing", "succeeded"]
     assert not list((server.data / "blobs" / "work").glob("*/*")), "the work of finished jobs is swept away"
+
+
+def test_a_cluster_of_somebody_else_s(make_server: Make, box: Path, tmp_path: Path, expected: dict[str, str]) -> None:
+    """Two workers of Dask's own, each with a shard at a time: the same bytes again."""
+    url = f"tcp://127.0.0.1:{free_port()}"
+    common = ["--host", "127.0.0.1", "--no-dashboard"]
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", *common, "--port", url.rpartition(":")[2]]
+    worker = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        *common,
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--preload",
+        "service.worker",
+        url,
+    ]
+    env = environment(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
+    processes: list[subprocess.Popen[bytes]] = []
+    try:
+        with open(tmp_path / "dask.log", "w") as log:
+            processes += [
+                subprocess.Popen(command, env=env, cwd=tmp_path, stdout=log, stderr=log) for command in (scheduler, worker, worker)
+            ]
+        server = make_server("data", "--dask", url)
+        server.wait_ready()
+        assert not server.workers(), "none of its own"
+        with server.client() as client:
+            done = client.wait(submit(client, box)).check()
+            assert contents(client.fetch(done, tmp_path / "box.zip")) == expected
+            job = submit(client, box, ENDLESS)
+            next(e for e in client.events(job) if e.type == "progress" and e.document["fraction"] > 0.02)
+            client.cancel(job)
+            assert client.wait(job).state == "cancelled"
+            assert busy([psutil.Process(p.pid) for p in processes], 0.3) < 0.15
+    finally:
+        for process in processes[::-1]:
+            process.kill()
+            process.wait()
 
 
 def test_a_shutdown_does_not_wait_for_listeners(make_server: Make, box: Path) -> None:
