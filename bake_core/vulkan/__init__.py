@@ -1,6 +1,6 @@
 """Vulkan 1.3 as far as pictures need it: buffers, textures, targets, draws and dispatches. Nothing else in octobake touches Vulkan.
 
-Importing this package where there is no Vulkan loader raises MachineError ``vulkan.missing``, so import it where it is used.
+Making a :class:`Device` where there is no Vulkan raises MachineError ``vulkan.missing``; importing this package does not.
 """
 
 from bake_core.vulkan.commands import Commands, Draw

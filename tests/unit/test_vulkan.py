@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,6 +94,18 @@ def test_without_a_driver_the_package_to_install_is_named() -> None:
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("vulkan.missing")
     assert "mesa-vulkan-drivers" in done.stdout
+
+
+def test_without_a_loader_only_what_needs_pictures_fails(tmp_path: Path) -> None:
+    """Importing verification must not: the service bakes on machines that have no Vulkan."""
+    # The package of this name opens libvulkan.so.1 when it is imported, and this is what it does where there is none.
+    (tmp_path / "vulkan.py").write_text('raise OSError("Cannot find Vulkan SDK version")')
+    lines = ("from bake_core import verification", "from bake_core.errors import MachineError", "try:", "    verification.Device()")
+    code = "\n".join((*lines, "except MachineError as e:", "    print(e.slug, e)"))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("vulkan.missing"), done.stderr
+    assert "libvulkan1" in done.stdout
 
 
 def test_two_devices_do_not_disturb_each_other() -> None:
