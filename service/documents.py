@@ -15,8 +15,11 @@ Digest = Annotated[
     Field(pattern=r"^sha256:[0-9a-f]{64}$", examples=["sha256:2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae"]),
 ]
 LABEL_KEY = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
+# Control characters, NUL above all, are text that not every database and no terminal takes.
+PLAIN = r"^[^\x00-\x1f\x7f]*$"
+FileName = Annotated[str, Field(pattern=PLAIN, min_length=1, max_length=1024)]
 Labels = Annotated[
-    dict[Annotated[str, Field(pattern=LABEL_KEY)], Annotated[str, Field(max_length=256)]],
+    dict[Annotated[str, Field(pattern=LABEL_KEY)], Annotated[str, Field(max_length=256, pattern=PLAIN)]],
     Field(max_length=32, description="For your own use; lists can be filtered by them.", examples=[{"level": "rooms"}]),
 ]
 Priority = Annotated[int, Field(ge=-1000, le=1000, description="Higher goes first; equals go in order of arrival.")]
@@ -67,8 +70,8 @@ class Problem(BaseModel):
 class SceneRequest(_Request):
     """A scene of several files, each uploaded as a blob before."""
 
-    root: str = Field(description="Name of the .gltf or .glb among `files`.", examples=["room.gltf"])
-    files: dict[str, Digest] = Field(description="Name, as URIs in the scene say it, to digest.", min_length=1, max_length=10_000)
+    root: FileName = Field(description="Name of the .gltf or .glb among `files`.", examples=["room.gltf"])
+    files: dict[FileName, Digest] = Field(description="Name, as URIs in the scene say it, to digest.", min_length=1, max_length=10_000)
 
 
 class Scene(BaseModel):

@@ -132,6 +132,10 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
 
 def _cursor(text: str) -> int:
     try:
-        return int(base64.urlsafe_b64decode(text.encode("ascii")))
+        sequence = int(base64.urlsafe_b64decode(text.encode("ascii")))
     except (ValueError, binascii.Error):
-        raise RequestError("request.invalid", "is not a cursor that this service gave", "cursor", 422) from None
+        sequence = 0
+    # Beyond 63 bits no database has an integer.
+    if not 0 < sequence < 2**63:
+        raise RequestError("request.invalid", "is not a cursor that this service gave", "cursor", 422)
+    return sequence

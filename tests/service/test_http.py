@@ -153,6 +153,11 @@ def test_a_scene_of_files_has_the_digest_that_the_command_line_gives_it(http: In
         http.post("/v1/scenes", json={"root": "room.gltf", "files": {"room.gltf": files["room.gltf"]}}), 422, "gltf.missing_file"
     )
     assert "a b.bin" in unnamed["detail"]
+    problem(
+        http.post("/v1/scenes", content=b'{"root": "\\ud800", "files": {}}', headers={"content-type": "application/json"}),
+        422,
+        "request.invalid",
+    )
     absent = {**files, "a b.bin": f"sha256:{'0' * 64}"}
     assert (
         problem(http.post("/v1/scenes", json={"root": "room.gltf", "files": absent}), 422, "blob.unknown")["where"] == "body.files.a b.bin"
@@ -194,6 +199,8 @@ def test_an_unknown_scene(http: InProcess) -> None:
         (json.dumps({"scene": DIGEST, "spec": {}, "extra": 1}).encode(), 422, "request.unknown_key", "body.extra"),
         (json.dumps({"scene": DIGEST, "spec": {}, "priority": "1"}).encode(), 422, "request.invalid", "body.priority"),
         (json.dumps({"scene": DIGEST, "spec": {}, "labels": {"-": ""}}).encode(), 422, "request.invalid", "body.labels.-.[key]"),
+        (json.dumps({"scene": DIGEST, "spec": {}, "labels": {"a": "\0"}}).encode(), 422, "request.invalid", "body.labels.a"),
+        (json.dumps({"scene": DIGEST, "spec": {}, "labels": {"a": "\ud800"}}).encode(), 422, "request.invalid", "body.labels.a"),
         (json.dumps({"scene": DIGEST, "spec": {"volumes": []}}).encode(), 422, "spec.invalid", "spec: volumes"),
         (json.dumps({"scene": DIGEST, "spec": {"probes": 1}}).encode(), 422, "spec.unknown_key", "spec: probes"),
         (json.dumps({"scene": DIGEST, "spec": box_spec()}).encode(), 422, "scene.unknown", "body.scene"),
@@ -281,7 +288,14 @@ def test_lists_are_paged_and_filtered(http: InProcess) -> None:
 
 @pytest.mark.parametrize(
     ("query", "where"),
-    [("state=done", "query.state"), ("limit=0", "query.limit"), ("label=x", "label"), ("cursor=%21", "cursor"), ("cursor=é", "cursor")],
+    [
+        ("state=done", "query.state"),
+        ("limit=0", "query.limit"),
+        ("label=x", "label"),
+        ("cursor=%21", "cursor"),
+        ("cursor=OTk5OTk5OTk5OTk5OTk5OTk5OTk5OTk5", "cursor"),
+        ("cursor=é", "cursor"),
+    ],
 )
 def test_a_list_that_cannot_be(http: InProcess, query: str, where: str) -> None:
     assert problem(http.get(f"/v1/bakes?{query}"), 422, "request.invalid")["where"] == where
