@@ -68,7 +68,7 @@ def assemble(
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
-    for name in SHADERS:
+    for name in (*SHADERS, "README.md"):
         shutil.copyfile(shader_dir() / name, shaders / name)
     (shaders / "constants.glsl").write_text(bundle_constants(data))
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())

@@ -133,6 +133,8 @@ class Driver:
         clock.stage("building")
         probes, threads = self._one(worker.prepare, work)
         self._move(State.RUNNING)
+        clock.stage("compiling")
+        self._one(worker.compile_kernels, work)
         clock.stage("tracing")
         run = bake.Run(threads, 1, curve=[Point(p.last, _seconds(p), p.error) for p in merged])
         if merged:

@@ -75,6 +75,12 @@ def prepare(work: Work) -> tuple[int, int]:
         return _prepared(work).probe_count, work.own_threads
 
 
+def compile_kernels(work: Work) -> None:
+    """Compile what the scene needs, or fetch it from the cache: its time is no sample's."""
+    with _task():
+        bake.compile_kernels(_prepared(work))
+
+
 def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int]) -> tuple[str, float]:
     """One shard of one pass; answers where its sums are stored and the seconds it took."""
     with _task() as task:
