@@ -109,7 +109,7 @@ def coverage(probes: int, correlated: bool, samples: int, sigma: Array, trials: 
 
 @pytest.mark.parametrize(("probes", "samples", "loosest"), [(1, 64, 6.0), (2, 64, 3.0), (8, 64, 1.8), (30, 18, 1.4), (100, 16, 1.2)])
 def test_the_bound_holds_95_times_out_of_100(probes: int, samples: int, loosest: float) -> None:
-    """Where a probe's texels err alike: not less, and not much more either. Of many probes the mean is well known, and the bound is tight."""
+    """Where a probe's texels err alike: not less, not much more either. Of many probes the mean is well known, and the bound tight."""
     held, ratio = coverage(probes, True, samples, np.full((probes, 1, 1, 1), 0.4))
     assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 600) < held < 0.985
     assert ratio < loosest
