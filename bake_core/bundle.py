@@ -296,18 +296,21 @@ def _read_folder(folder: Path, path: Path) -> Bundle:
             file = _inside(folder, name, path)
             if not file.is_file() or digest_file(file) != entry["sha256"]:
                 raise BundleError("bundle.damaged", f"{name} is missing or not what the manifest says; fetch or bake it again", str(path))
-        return Bundle(manifest, tuple(_read_volume(folder, v) for v in manifest["volumes"]), path)
+        return Bundle(manifest, tuple(_read_volume(folder, v, manifest["files"]) for v in manifest["volumes"]), path)
     except (AttributeError, KeyError, TypeError, ValueError) as e:
         raise BundleError("bundle.damaged", f"its manifest lacks or misstates {e}", str(path)) from None
 
 
-def _read_volume(folder: Path, v: dict[str, Any]) -> VolumeData:
+def _read_volume(folder: Path, v: dict[str, Any], files: dict[str, Any]) -> VolumeData:
     n = int(np.prod(v["counts"]))
     packing = v["layout"]
     backface = np.asarray(v["probes"]["backface"], np.float32)
     if len(v["counts"]) != 3 or backface.shape != (n,):
         raise ValueError(f"volume {v['name']!r}: its counts are not those of its probes")
     atlases = {}
+    for file in (v["probes"]["file"], *(a["file"] for a in v["atlases"])):
+        if file not in files:
+            raise ValueError(f"the digest of {file!r}")
     for a in v["atlases"]:
         pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
         height = packing["rows"] * a["tile"]
