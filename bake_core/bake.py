@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -37,8 +38,8 @@ from bake_core.spec import Spec
 from bake_core.tally import State, Tally
 from bake_core.transport import Tracer
 
-# Probes whose distances are held at once: 64² rays of 33 bytes each, some 35 MB.
-_DISTANCE_CHUNK = 256
+# Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
+_DISTANCE_CHUNK = 64
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def trace_shard(
         prepared.tracer, positions, ids, samples, capture, threads=threads, cancelled=flag, advance=advance
     )
     empty = np.zeros
-    seen = _see(prepared, positions, prepared.limits[slice(*probes)], flag) if samples[0] == 0 else {}
+    seen = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else {}
     return Tally(
         *probes,
         *samples,
@@ -168,25 +169,31 @@ def compile_kernels(prepared: Prepared) -> None:
     trace_shard(prepared, (0, 0), (0, 0), threads=1)
 
 
-def _see(prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], flag: NDArray[np.uint8]) -> dict[str, Any]:
-    """Distances and what is made of them, a few probes at a time."""
+def _see(
+    prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], threads: int, flag: NDArray[np.uint8]
+) -> dict[str, NDArray[np.float32]]:
+    """Distances and what is made of them, a few probes at a time on each thread."""
     s = prepared.selection
-    parts: dict[str, list[NDArray[np.float32]]] = {"visibility": [], "backface": [], "distance": [], "normal": []}
     solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
-    for first in range(0, max(len(positions), 1), _DISTANCE_CHUNK):
+
+    def look(first: int) -> dict[str, NDArray[np.float32]]:
         chunk = slice(first, first + _DISTANCE_CHUNK)
         distance, normal, back = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
         # One row at a time: a matrix product's bits may depend on how many rows it has.
-        parts["backface"].append(np.array([solid_angle[row].sum() for row in back], np.float32))
+        seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
         if s.keeps("visibility"):
-            parts["visibility"].append(visibility_moments(distance, limits[chunk], s.visibility))
+            seen["visibility"] = visibility_moments(distance, limits[chunk], s.visibility)
         if s.keeps("distance"):
-            parts["distance"].append(np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32))
+            seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
         if s.keeps("normal"):
             if s.normal != s.distance:
                 _, normal, _ = capture_distance(prepared.tracer, positions[chunk], s.normal, cancelled=flag)
-            parts["normal"].append(normal)
-    return {name: np.concatenate(rows) for name, rows in parts.items() if rows}
+            seen["normal"] = normal
+        return seen
+
+    with ThreadPoolExecutor(threads) as pool:
+        parts = list(pool.map(look, range(0, max(len(positions), 1), _DISTANCE_CHUNK)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 @dataclass

@@ -336,7 +336,7 @@ def capture_radiance(
             irradiance[:] = _sum_blocks(np.stack(list(pool.map(trace_block, range(BLOCKS))), 1))
         else:
             # Small enough that threads end together, large enough that Python's part is nothing.
-            step = max(1, min(n // (8 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(samples[1] - samples[0], 1))))
+            step = max(1, min(n // (32 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(samples[1] - samples[0], 1))))
             starts = range(0, n, step)
             for _ in pool.map(lambda first: trace_probes(first, min(first + step, n)), starts):
                 pass
