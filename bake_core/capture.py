@@ -59,16 +59,16 @@ def _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, rate, ke
         reversed_index = reverse_bits(uint32((sample // SCRAMBLES * texels + texel) // _TEXELS_PER_LIGHT_SAMPLE))
         u, v = sobol_pair(reversed_index, key)
         choice, _ = sobol_pair(reversed_index, key + uint64(1))
-        e, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], u, v, choice)
+        le, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], u, v, choice)
         x, y, z = end[0] - position[0], end[1] - position[1], end[2] - position[2]
         if pdf <= 0 or blocked(t, ray, ray_bits, position[0], position[1], position[2], x, y, z, np.float32(1)):
             continue
         # The density of capture rays in this direction; the 1-norm takes a unit vector onto the octahedron.
         reach = 1 / (abs(d[0]) + abs(d[1]) + abs(d[2]))
         gain = 1 / (texels / 4 * (reach * reach * reach) + rate * pdf)
-        fr = np.float32(gain * t.emitters.radiance[e, 0])
-        fg = np.float32(gain * t.emitters.radiance[e, 1])
-        fb = np.float32(gain * t.emitters.radiance[e, 2])
+        fr = np.float32(gain * le[0])
+        fg = np.float32(gain * le[1])
+        fb = np.float32(gain * le[2])
         fx, fy, fz = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
         for i in range(m):
             f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
@@ -151,7 +151,10 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     b += -fold if b >= 0 else fold
                     length = math.sqrt(a * a + b * b + c * c)
                     dx, dy, dz = a / length, b / length, c / length
-                    emitted, direct, indirect, _, emitter_pdf = trace_path(t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False)
+                    density = texels / 4 * (length * length * length)
+                    emitted, direct, indirect, _, emitter_pdf = trace_path(
+                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False, math.sqrt(1 / density)
+                    )
                     red, green, blue = (
                         emitted[0] + direct[0] + indirect[0],
                         emitted[1] + direct[1] + indirect[1],
@@ -161,7 +164,6 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     total_g += green
                     total_b += blue
                     count += 1
-                    density = texels / 4 * (length * length * length)
                     solid_angle = np.float32(1 / density)
                     # What light samples find too, they find better: the balance heuristic leaves this sample its share.
                     share = density / (density + light_rate * emitter_pdf)

@@ -34,6 +34,20 @@ from bake_core.materials import INV_PI, MaterialTable, lambert_cosine, material_
 from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair, uniform_triangle
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
+from bake_core.textures import (
+    BASE_COLOR,
+    METALLIC_ROUGHNESS,
+    AlphaTable,
+    TextureTable,
+    alpha_table,
+    emission_at,
+    emits_unevenly,
+    lets_through,
+    look_up,
+    mean_emission,
+    opacity,
+    texture_table,
+)
 
 # Roulette by throughput begins where a path has lost 90 % of its weight. With the chance to go on equal to throughput / τ below τ, a
 # furnace of albedo a has a relative σ of τ√a from roulette: 10 % of a path here, against 100 % where τ = 1.
@@ -51,8 +65,13 @@ _EPSILON = 2.0**-20
 _INSET = 2.0**-17
 _INVALID = 0xFFFFFFFF
 _INFINITE = np.float32(np.inf)
-# Camera rays pass through back faces; this many before giving up bounds the loop on a pile of coincident ones.
-_MAX_PASSED = 256
+# Camera rays pass through back faces, all rays through what alpha cuts out; this many before giving up bounds the loop.
+_MAX_PASSED = 4096
+# Where a shadow ray goes on behind a hole: distances along one ray are accurate to about an ulp of themselves.
+_PASSED = 1 + 2.0**-20
+# A ray drawn with density p stands for 1/(N p) of solid angle (Colbert and Křivánek 2007, "GPU-Based Importance Sampling", GPU Gems 3).
+# N is what makes a ray straight up from a Lambert surface, p = 1/π, stand for as much as a texel of a 16 × 16 capture map.
+_LOBE_RAYS = 64.0
 
 
 class Tables(NamedTuple):
@@ -80,6 +99,8 @@ class Tables(NamedTuple):
     item_transform: NDArray[np.float64]
     item_normal: NDArray[np.float64]
     materials: MaterialTable
+    textures: TextureTable
+    alpha: AlphaTable
     emitters: EmitterTable
     lights: LightTable
     environment: NDArray[np.float64]
@@ -118,11 +139,15 @@ class Tracer:
             item_transform=transforms,
             item_normal=_normal_matrices(transforms[:, :, :3]),
             materials=material_table(scene),
+            textures=texture_table(scene),
+            alpha=alpha_table(scene),
             emitters=emitter_table(scene),
             lights=light_table(lights, scene.bounds - scene.origin),
             environment=environment_radiance(spec),
             max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
         )
+        if emits_unevenly(scene):
+            tables = tables._replace(emitters=emitter_table(scene, mean_emission(tables, scene)))
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
 
 
@@ -151,6 +176,11 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
         Vertex colour.
     material : int
     front : bool
+    triangle : int
+    b1, b2 : float64
+        Where in the triangle.
+    twice_area : float64
+        Of the triangle in the local frame, m².
     """
     item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
     triangle = t.item_first_triangle[item] + ray_bits[17]
@@ -192,6 +222,7 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
             k[2, 0] * gx + k[2, 1] * gy + k[2, 2] * gz,
         )
     length = math.sqrt(gx * gx + gy * gy + gz * gz)
+    twice_area = length
     if length > 0:
         gx, gy, gz = gx / length, gy / length, gz / length
     else:
@@ -227,15 +258,54 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
         green = b0 * c[0, 1] + b1 * c[1, 1] + b2 * c[2, 1]
         blue = b0 * c[0, 2] + b1 * c[1, 2] + b2 * c[2, 2]
     material = t.triangle_material[triangle]
-    return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front
+    return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front, triangle, b1, b2, twice_area
+
+
+@kernel
+def reflectance(t, s, width, cosine):
+    """Base colour (vertex colour included), metallic and roughness of a hit, averaged over the footprint of a ray this wide.
+
+    Returns
+    -------
+    red, green, blue, metallic, roughness : float64
+    """
+    color, material, triangle = s[3], s[4], s[6]
+    red = float(t.materials.albedo[material, 0]) * color[0]
+    green = float(t.materials.albedo[material, 1]) * color[1]
+    blue = float(t.materials.albedo[material, 2]) * color[2]
+    metallic, roughness = 0.0, 1.0
+    if t.textures.slots.shape[0]:
+        slots = t.textures.slots[material]
+        share = 2 * width * width / (max(cosine, 1e-3) * s[9]) if s[9] > 0 else 0.0
+        if slots[BASE_COLOR] >= 0:
+            r, g, b = look_up(t.textures, slots[BASE_COLOR], triangle, s[7], s[8], share)
+            red, green, blue = red * r, green * g, blue * b
+        if slots[METALLIC_ROUGHNESS] >= 0:
+            _, g, b = look_up(t.textures, slots[METALLIC_ROUGHNESS], triangle, s[7], s[8], share)
+            metallic, roughness = metallic * b, roughness * g
+    return red, green, blue, metallic, roughness
 
 
 @kernel
 def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
-    """Whether anything lies between a point and the light."""
+    """Whether anything lies between a point and the light: any hit, or hit after hit where something in the scene is cut out."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
-    occluded1(t.handle, ray.ctypes.data, 0)
-    return ray[8] < 0
+    if t.alpha.mode.shape[0] == 0:
+        occluded1(t.handle, ray.ctypes.data, 0)
+        return ray[8] < 0
+    for _ in range(_MAX_PASSED):
+        intersect1(t.handle, ray.ctypes.data, 0)
+        if ray_bits[18] == _INVALID:
+            return False
+        item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
+        triangle = t.item_first_triangle[item] + ray_bits[17]
+        material = t.triangle_material[triangle]
+        if not lets_through(t.textures, t.alpha, material, triangle, float(ray[15]), float(ray[16]), ray_bits):
+            return True
+        beyond = np.float32(ray[8] * _PASSED)
+        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
+        ray[3] = beyond
+    return True
 
 
 @kernel
@@ -246,6 +316,15 @@ def pdf_emitter(t, strength, two_sided, d2, facing):
 
 
 @kernel
+def emitter_strength(t, material, triangle):
+    """What a triangle's part in the emitters' power is weighted by: its mean radiance, summed over channels."""
+    if t.emitters.strength.shape[0]:
+        return t.emitters.strength[triangle]
+    le = t.materials.emission[material]
+    return float(le[0]) + float(le[1]) + float(le[2])
+
+
+@kernel
 def sample_emitter(t, px, py, pz, u, v, w):
     """A point on the emissive triangles, chosen by power and area, as seen from a point.
 
@@ -253,11 +332,12 @@ def sample_emitter(t, px, py, pz, u, v, w):
 
     Returns
     -------
-    (int, 3 float64, float64, 3 float64)
-        The triangle, the unit direction to the point, its pdf per solid angle (0: it shines the other way), and the point lifted off its surface
-        towards the viewer, so that the emitter does not block itself.
+    (3 float64, 3 float64, float64, 3 float64)
+        The radiance there, the unit direction to the point, its pdf per solid angle (0: no light comes from there), and the point lifted
+        off its surface towards the viewer, so that the emitter does not block itself.
     """
     e = t.emitters
+    radiance = (0.0, 0.0, 0.0)
     i, _ = choose(e.cdf, float(w))
     b1, b2 = uniform_triangle(u, v)
     b0 = 1.0 - b1 - b2
@@ -274,11 +354,17 @@ def sample_emitter(t, px, py, pz, u, v, w):
         facing = -(dx * e.normal[i, 0] + dy * e.normal[i, 1] + dz * e.normal[i, 2])
         side = 1.0 if facing > 0 else -1.0
         if facing > 0 or (facing < 0 and e.double_sided[i]):
-            strength = e.radiance[i, 0] + e.radiance[i, 1] + e.radiance[i, 2]
-            pdf = pdf_emitter(t, strength, e.double_sided[i], d2, facing * side)
+            material, triangle = e.material[i], e.triangle[i]
+            radiance = emission_at(t, material, triangle, float(b1), float(b2), 0.0)
+            if t.alpha.mode.shape[0]:
+                # Its own surface cannot block what leaves it, so the holes in it are counted here.
+                there = opacity(t.textures, t.alpha, material, triangle, float(b1), float(b2))
+                radiance = (there * radiance[0], there * radiance[1], there * radiance[2])
+            if radiance[0] + radiance[1] + radiance[2] > 0:
+                pdf = pdf_emitter(t, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
     lift = side * _EPSILON * (abs(x) + abs(y) + abs(z))
     lifted = (x + lift * e.normal[i, 0], y + lift * e.normal[i, 1], z + lift * e.normal[i, 2])
-    return i, (dx, dy, dz), pdf, lifted
+    return radiance, (dx, dy, dz), pdf, lifted
 
 
 @kernel
@@ -287,7 +373,7 @@ def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):
 
     The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
     """
-    i, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
+    radiance, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
     cosine = lambert_cosine(d[0], d[1], d[2], n)
     if pdf <= 0 or cosine <= 0:
         return 0.0, 0.0, 0.0
@@ -296,7 +382,7 @@ def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):
     if blocked(t, ray, ray_bits, ox, oy, oz, end[0] - ox, end[1] - oy, end[2] - oz, np.float32(1.0)):
         return 0.0, 0.0, 0.0
     gain = cosine * INV_PI / (pdf + cosine * INV_PI)
-    return gain * t.emitters.radiance[i, 0], gain * t.emitters.radiance[i, 1], gain * t.emitters.radiance[i, 2]
+    return gain * radiance[0], gain * radiance[1], gain * radiance[2]
 
 
 @kernel
@@ -326,12 +412,13 @@ def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: 
         if ray_bits[18] == _INVALID:
             break
         s = surface(t, ray_bits, ray, dx, dy, dz)
-        if s[5] or not through_backs or t.materials.double_sided[s[4]]:
+        seen = s[5] or not through_backs or t.materials.double_sided[s[4]]
+        if seen and (t.alpha.mode.shape[0] == 0 or not lets_through(t.textures, t.alpha, s[4], s[6], s[7], s[8], ray_bits)):
             return True, s
         # Leave on the far side: the surface's normal looks back at us.
         ox, oy, oz = s[0][0] - s[2] * s[1][0], s[0][1] - s[2] * s[1][1], s[0][2] - s[2] * s[1][2]
     nothing = (0.0, 0.0, 0.0)
-    return False, (nothing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, nothing, np.uint32(0), True)
+    return False, (nothing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, nothing, np.uint32(0), True, np.int64(0), 0.0, 0.0, 0.0)
 
 
 @kernel
@@ -343,7 +430,7 @@ def sample_pair(reversed_index, index, depth, key):
 
 
 @kernel
-def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera):  # type: ignore[no-untyped-def]
+def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread):  # type: ignore[no-untyped-def]
     """One path.
 
     Parameters
@@ -357,6 +444,8 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Sample point: its index within its scramble, with bits reversed and plain, and what picks the scramble.
     camera : bool
         Pass through back faces on the first ray.
+    spread : float
+        Width of what the ray stands for, radians: the square root of its solid angle. Textures are averaged over it.
 
     Returns
     -------
@@ -380,6 +469,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     by_throughput = 1.0
     dark = 0
     pdf = 0.0
+    width = 0.0
     hit_any = False
     emitter_pdf = 0.0
     depth = 0
@@ -405,23 +495,19 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_g += beta_g / survival * t.environment[1]
                 indirect_b += beta_b / survival * t.environment[2]
             break
-        p, n, epsilon, color, material, front = s
+        p, n, epsilon, _, material, front, triangle, b1, b2, _ = s
         two_sided = t.materials.double_sided[material]
         if depth == 0:
             hit_any = True
         if not front and not two_sided:
             break
         dark += 1
-        le_r, le_g, le_b = (
-            float(t.materials.emission[material, 0]),
-            float(t.materials.emission[material, 1]),
-            float(t.materials.emission[material, 2]),
-        )
-        strength = le_r + le_g + le_b
-        if strength > 0:
+        le_r, le_g, le_b = emission_at(t, material, triangle, b1, b2, 0.0)
+        hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
+        facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
+        if le_r + le_g + le_b > 0:
             dark = 0
-            hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
-            facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
+            strength = emitter_strength(t, material, triangle)
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
                 emitter_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
@@ -432,9 +518,12 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b * gain * le_b
         if depth >= t.max_bounces:
             break
-        beta_r *= float(t.materials.albedo[material, 0]) * color[0]
-        beta_g *= float(t.materials.albedo[material, 1]) * color[1]
-        beta_b *= float(t.materials.albedo[material, 2]) * color[2]
+        if t.textures.slots.shape[0]:
+            width += spread * math.sqrt(hx * hx + hy * hy + hz * hz)
+        base_r, base_g, base_b, _, _ = reflectance(t, s, width, facing)
+        beta_r *= base_r
+        beta_g *= base_g
+        beta_b *= base_b
         most = max(beta_r, beta_g, beta_b)
         if most <= 0:
             break
@@ -478,5 +567,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
         dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
         pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+        if t.textures.slots.shape[0]:
+            spread = max(spread, math.sqrt(1 / (_LOBE_RAYS * max(pdf, 1e-3))))
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, emitter_pdf

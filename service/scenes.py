@@ -22,7 +22,7 @@ def load_stored(blobs: Blobs, scene: Mapping[str, Any]) -> Scene:
 
 
 class Outlines:
-    """The last scenes asked for, without their geometry."""
+    """The last scenes asked for, without their geometry and images."""
 
     def __init__(self, blobs: Blobs) -> None:
         self._blobs = blobs
@@ -40,8 +40,8 @@ class Outlines:
     def add(self, scene: Scene) -> Scene:
         """Keep and answer the outline of a scene that is at hand."""
         # Copies, for a slice would keep the whole array alive.
-        arrays = ("positions", "normals", "colors", "indices", "triangle_material")
-        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays})
+        arrays = ("positions", "normals", "colors", "uvs", "indices", "triangle_material")
+        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays}, images=())
         with self._lock:
             self._kept[scene.digest] = outline
             while len(self._kept) > KEPT_OUTLINES:
