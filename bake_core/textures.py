@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.kernels import entry_kernel, kernel
+from bake_core.kernels import either, entry_kernel, kernel
 from bake_core.sampling import mix64, uniform_triangle
 from bake_core.scene import ALPHA_BLEND, ALPHA_MASK, ALPHA_OPAQUE, NO_TEXTURE, WRAP_CLAMP, WRAP_REPEAT, Image, Scene
 
@@ -29,10 +29,13 @@ BASE_COLOR, METALLIC_ROUGHNESS, EMISSIVE = 0, 1, 2
 _MAX_COORDINATE = 1e12
 # Points at which a triangle's emission is averaged; each stands for its share of the texels, by the level that it looks at.
 _EMISSION_POINTS = 8
+# A ray drawn with density p stands for 1/(N p) of solid angle (Colbert and Křivánek 2007, "GPU-Based Importance Sampling", GPU Gems 3).
+# N is what makes a ray straight up from a Lambert surface, p = 1/π, stand for as much as a texel of a 16 × 16 capture map.
+_LOBE_RAYS = 64.0
 
 
 class TextureTable(NamedTuple):
-    """All textures of a scene; every array is empty where no material in use has any.
+    """All that makes a material uneven: textures, holes, unlit vertex colours. Arrays are empty where nothing in the scene needs them.
 
     Attributes
     ----------
@@ -51,6 +54,10 @@ class TextureTable(NamedTuple):
         sRGB code to linear value.
     unlit : (m,) bool
         Whose emission the vertex colour multiplies.
+    alpha_mode : (m,) uint8
+    alpha_factor, alpha_cutoff : (m,) float32
+    alpha_vertex : (t, 3) float32
+        COLOR_0's alpha by corner; empty where it is 1 everywhere.
     """
 
     slots: NDArray[np.int32]
@@ -62,18 +69,10 @@ class TextureTable(NamedTuple):
     texels: NDArray[np.uint16]
     decode: F32
     unlit: NDArray[np.bool_]
-
-
-class AlphaTable(NamedTuple):
-    """What is cut out; every array is empty where no material in use is.
-
-    mode (m,) uint8; factor, cutoff (m,) float32; vertex (t, 3) float32: COLOR_0's alpha by corner, empty where no mesh has any below 1.
-    """
-
-    mode: NDArray[np.uint8]
-    factor: F32
-    cutoff: F32
-    vertex: F32
+    alpha_mode: NDArray[np.uint8]
+    alpha_factor: F32
+    alpha_cutoff: F32
+    alpha_vertex: F32
 
 
 def srgb_to_linear(encoded: F64) -> F64:
@@ -88,31 +87,22 @@ def linear_to_srgb(linear: F64) -> F64:
     return out
 
 
-def texture_table(scene: Scene) -> TextureTable:
-    """The kernels' view of a scene's textures."""
+def texture_table(scene: Scene) -> TextureTable | None:
+    """The kernels' view of a scene's textures and holes; None where it has none."""
     m = scene.materials
-    slots = np.stack([m.base_color_texture, m.metallic_roughness_texture, m.emissive_texture], 1).astype(np.int32)
     unlit = m.unlit if m.unlit.any() else np.zeros(0, np.bool_)
-    if not scene.textures:
-        none = np.zeros
-        return TextureTable(
-            none((0, 3), np.int32),
-            none((0, 3, 2), np.float32),
-            none((0, 6), np.int32),
-            none((0, 2, 3)),
-            none(0, np.bool_),
-            none((0, 3), np.int64),
-            none((0, 4), np.uint16),
-            none(0, np.float32),
-            unlit,
-        )
-    cutoffs = _cutoffs(scene)
+    has_alpha = bool((m.alpha_mode[np.unique(scene.triangle_material)] != ALPHA_OPAQUE).any())
+    if not (scene.textures or has_alpha or unlit.size):
+        return None
+    vertex = np.zeros((0, 3), np.float32)
+    if has_alpha and len(scene.colors) and (scene.colors[:, 3] < 1).any():
+        vertex = np.ascontiguousarray(scene.colors[scene.indices, 3])
     pyramids: dict[tuple[int, bool, float], tuple[int, int]] = {}
     levels: list[tuple[int, int, int]] = []
-    texels: list[NDArray[np.uint16]] = []
+    texels: list[NDArray[np.uint16]] = [np.zeros((0, 4), np.uint16)]
     sampling = []
     size = 0
-    for texture, cutoff in zip(scene.textures, cutoffs, strict=True):
+    for texture, cutoff in zip(scene.textures, _cutoffs(scene), strict=True):
         key = (texture.image, texture.srgb, cutoff)
         if key not in pyramids:
             made = pyramid(scene.images[texture.image], texture.srgb, cutoff)
@@ -122,30 +112,22 @@ def texture_table(scene: Scene) -> TextureTable:
                 texels.append(level.reshape(-1, 4))
                 size += len(texels[-1])
         sampling.append((*pyramids[key], *texture.wrap, int(texture.nearest), texture.uv_set))
+    slots = np.stack([m.base_color_texture, m.metallic_roughness_texture, m.emissive_texture], 1).astype(np.int32)
     return TextureTable(
-        slots,
-        scene.uvs[scene.indices],
-        np.array(sampling, np.int32),
-        np.array([t.transform for t in scene.textures], np.float64),
-        np.array([t.srgb for t in scene.textures], np.bool_),
-        np.array(levels, np.int64),
-        np.concatenate(texels),
-        srgb_to_linear(np.arange(65536) / 65535).astype(np.float32),
-        unlit,
+        slots=slots if scene.textures else np.zeros((0, 3), np.int32),
+        uvs=scene.uvs[scene.indices] if scene.textures else np.zeros((0, 3, 2), np.float32),
+        sampling=np.array(sampling, np.int32).reshape(-1, 6),
+        transform=np.array([t.transform for t in scene.textures], np.float64).reshape(-1, 2, 3),
+        srgb=np.array([t.srgb for t in scene.textures], np.bool_),
+        levels=np.array(levels, np.int64).reshape(-1, 3),
+        texels=np.concatenate(texels),
+        decode=srgb_to_linear(np.arange(65536) / 65535).astype(np.float32),
+        unlit=unlit,
+        alpha_mode=m.alpha_mode if has_alpha else np.zeros(0, np.uint8),
+        alpha_factor=m.alpha,
+        alpha_cutoff=m.alpha_cutoff,
+        alpha_vertex=vertex,
     )
-
-
-def alpha_table(scene: Scene) -> AlphaTable:
-    """The kernels' view of what is cut out."""
-    m = scene.materials
-    used = np.unique(scene.triangle_material)
-    if (m.alpha_mode[used] == ALPHA_OPAQUE).all():
-        none = np.zeros(0, np.float32)
-        return AlphaTable(np.zeros(0, np.uint8), none, none, np.zeros((0, 3), np.float32))
-    vertex = np.zeros((0, 3), np.float32)
-    if len(scene.colors) and (scene.colors[:, 3] < 1).any():
-        vertex = np.ascontiguousarray(scene.colors[scene.indices, 3])
-    return AlphaTable(m.alpha_mode, m.alpha, m.alpha_cutoff, vertex)
 
 
 def _cutoffs(scene: Scene) -> list[float]:
@@ -319,14 +301,14 @@ def look_up(x, k, triangle, b1, b2, share):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def opacity(x, alpha, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
+def _opacity(x, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
     """How much of a point of a triangle is there: 0 or 1 where it is masked, in between where it is blended."""
-    mode = alpha.mode[material]
+    mode = x.alpha_mode[material]
     if mode == ALPHA_OPAQUE:
         return 1.0
-    value = float(alpha.factor[material])
-    if alpha.vertex.shape[0]:
-        c = alpha.vertex[triangle]
+    value = float(x.alpha_factor[material])
+    if x.alpha_vertex.shape[0]:
+        c = x.alpha_vertex[triangle]
         value *= (1.0 - b1 - b2) * c[0] + b1 * c[1] + b2 * c[2]
     if x.slots.shape[0]:
         k = x.slots[material, BASE_COLOR]
@@ -334,18 +316,25 @@ def opacity(x, alpha, material, triangle, b1, b2):  # type: ignore[no-untyped-de
             u, v = texture_point(x, k, triangle, b1, b2)
             value *= sample_alpha(x, k, u, v)
     if mode == ALPHA_MASK:
-        return 1.0 if value >= float(alpha.cutoff[material]) else 0.0
+        return 1.0 if value >= float(x.alpha_cutoff[material]) else 0.0
     return value
 
 
-@kernel
-def lets_through(x, alpha, material, triangle, b1, b2, ray_bits):  # type: ignore[no-untyped-def]
-    """Whether a ray goes on through its hit: where alpha cuts the surface out, else with probability 1 - alpha.
+# The kernels below take :class:`bake_core.transport.Tables`, and are nothing but the material's own columns where it has no textures.
 
-    The random number is a hash of ray and hit (Wyman and McGuire 2017, "Hashed Alpha Testing", without their anchoring): the same on every
-    run, and independent between any two rays that differ in a bit.
-    """
-    there = opacity(x, alpha, material, triangle, b1, b2)
+
+def _has_holes(t):  # type: ignore[no-untyped-def]
+    return t.textures.alpha_mode.shape[0] > 0
+
+
+# Whether any material in use is cut out or blended.
+has_holes = either("textures")(_has_holes)(lambda t: False)
+
+
+def _lets_through(t, material, triangle, b1, b2, ray_bits):  # type: ignore[no-untyped-def]
+    if t.textures.alpha_mode.shape[0] == 0:
+        return False
+    there = _opacity(t.textures, material, triangle, b1, b2)
     if there >= 1:
         return False
     if there <= 0:
@@ -357,24 +346,99 @@ def lets_through(x, alpha, material, triangle, b1, b2, ray_bits):  # type: ignor
     return float(h >> np.uint64(11)) * 2.0**-53 >= there
 
 
+# Whether a ray goes on through its hit (t, material, triangle, b1, b2, ray_bits): where alpha cuts the surface out, else with probability
+# 1 - alpha. The random number is a hash of ray and hit (after Wyman and McGuire 2017, "Hashed Alpha Testing"): the same on every run, and
+# another one for any two rays that differ in a bit.
+lets_through = either("textures")(_lets_through)(lambda t, material, triangle, b1, b2, ray_bits: False)
+
+
 @kernel
-def emission_at(t, material, triangle, b1, b2, share):  # type: ignore[no-untyped-def]
-    """Radiance that leaves a point of a triangle, as far as it is there: 3 float64. `t` is :class:`bake_core.transport.Tables`."""
-    red = float(t.materials.emission[material, 0])
-    green = float(t.materials.emission[material, 1])
-    blue = float(t.materials.emission[material, 2])
-    if t.textures.slots.shape[0] and red + green + blue > 0:
-        k = t.textures.slots[material, EMISSIVE]
+def _emission(t, material, triangle, b1, b2, share):  # type: ignore[no-untyped-def]
+    x = t.textures
+    le = t.materials.emission[material]
+    red, green, blue = float(le[0]), float(le[1]), float(le[2])
+    if x.slots.shape[0] and red + green + blue > 0:
+        k = x.slots[material, EMISSIVE]
         if k != NO_TEXTURE:
-            r, g, b = look_up(t.textures, k, triangle, b1, b2, share)
+            r, g, b = look_up(x, k, triangle, b1, b2, share)
             red, green, blue = red * r, green * g, blue * b
-    if t.textures.unlit.shape[0] and t.textures.unlit[material] and t.colors.shape[0]:
+    if x.unlit.shape[0] and x.unlit[material] and t.colors.shape[0]:
         c = t.colors[triangle]
         b0 = 1.0 - b1 - b2
         red *= b0 * c[0, 0] + b1 * c[1, 0] + b2 * c[2, 0]
         green *= b0 * c[0, 1] + b1 * c[1, 1] + b2 * c[2, 1]
         blue *= b0 * c[0, 2] + b1 * c[1, 2] + b2 * c[2, 2]
     return red, green, blue
+
+
+@kernel
+def _even_emission(t, material, triangle, b1, b2, share):  # type: ignore[no-untyped-def]
+    le = t.materials.emission[material]
+    return float(le[0]), float(le[1]), float(le[2])
+
+
+# Radiance that leaves a point of a triangle as far as it is there (t, material, triangle, b1, b2, share): 3 float64.
+emission_at = either("textures")(_emission)(_even_emission)
+
+
+def _emission_through_holes(t, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
+    r, g, b = _emission(t, material, triangle, b1, b2, 0.0)
+    there = _opacity(t.textures, material, triangle, b1, b2) if t.textures.alpha_mode.shape[0] else 1.0
+    return there * r, there * g, there * b
+
+
+def _emission_of_all(t, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
+    return _even_emission(t, material, triangle, b1, b2, 0.0)
+
+
+# The same times how much of the point is there: what a sample of the emitter itself gets, whom no ray has let pass its holes.
+emission_left = either("textures")(_emission_through_holes)(_emission_of_all)
+
+
+def _reflectance(t, s, width, cosine):  # type: ignore[no-untyped-def]
+    x = t.textures
+    color, material, triangle = s[3], s[4], s[6]
+    red = float(t.materials.albedo[material, 0]) * color[0]
+    green = float(t.materials.albedo[material, 1]) * color[1]
+    blue = float(t.materials.albedo[material, 2]) * color[2]
+    metallic, roughness = float(t.materials.metallic[material]), float(t.materials.roughness[material])
+    if x.slots.shape[0]:
+        slots = x.slots[material]
+        share = 2 * width * width / (max(cosine, 1e-3) * s[9]) if s[9] > 0 else 0.0
+        if slots[BASE_COLOR] != NO_TEXTURE:
+            r, g, b = look_up(x, slots[BASE_COLOR], triangle, s[7], s[8], share)
+            red, green, blue = red * r, green * g, blue * b
+        if slots[METALLIC_ROUGHNESS] != NO_TEXTURE:
+            _, g, b = look_up(x, slots[METALLIC_ROUGHNESS], triangle, s[7], s[8], share)
+            metallic, roughness = metallic * b, roughness * g
+    return red, green, blue, metallic, roughness
+
+
+def _even_reflectance(t, s, width, cosine):  # type: ignore[no-untyped-def]
+    albedo, color = t.materials.albedo[s[4]], s[3]
+    metallic, roughness = float(t.materials.metallic[s[4]]), float(t.materials.roughness[s[4]])
+    return float(albedo[0]) * color[0], float(albedo[1]) * color[1], float(albedo[2]) * color[2], metallic, roughness
+
+
+# Base colour (vertex colour included), metallic and roughness of a hit (t, surface, width, cosine), averaged over the footprint of a ray
+# `width` metres wide that meets it under `cosine`: 5 float64.
+reflectance = either("textures")(_reflectance)(_even_reflectance)
+
+
+def _widened(t, width, spread, distance):  # type: ignore[no-untyped-def]
+    return width + spread * distance
+
+
+# The width of a ray after a distance (t, width, spread, distance), metres; 0 where nobody asks.
+widened = either("textures")(_widened)(lambda t, width, spread, distance: 0.0)
+
+
+def _spread(t, spread, pdf):  # type: ignore[no-untyped-def]
+    return max(spread, math.sqrt(1 / (_LOBE_RAYS * max(pdf, 1e-3))))
+
+
+# The spread of a ray scattered with this density (t, spread before, pdf), radians: never less than before.
+scattered_spread = either("textures")(_spread)(lambda t, spread, pdf: spread)
 
 
 @entry_kernel
@@ -388,8 +452,8 @@ def _mean_emission(t, triangles, out):  # type: ignore[no-untyped-def]
         for row in range(n):
             for column in range(n):
                 b1, b2 = uniform_triangle((row + 0.5) / n, (column + 0.5) / n)
-                r, g, b = emission_at(t, material, triangle, b1, b2, 1.0 / (n * n))
-                there = opacity(t.textures, t.alpha, material, triangle, b1, b2) if t.alpha.mode.shape[0] else 1.0
+                r, g, b = _emission(t, material, triangle, b1, b2, 1.0 / (n * n))
+                there = _opacity(t.textures, material, triangle, b1, b2) if t.textures.alpha_mode.shape[0] else 1.0
                 total += there * (r + g + b)
         out[triangle] = total / (n * n)
 

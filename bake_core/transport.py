@@ -35,18 +35,17 @@ from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair, uni
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
 from bake_core.textures import (
-    BASE_COLOR,
-    METALLIC_ROUGHNESS,
-    AlphaTable,
     TextureTable,
-    alpha_table,
     emission_at,
+    emission_left,
     emits_unevenly,
+    has_holes,
     lets_through,
-    look_up,
     mean_emission,
-    opacity,
+    reflectance,
+    scattered_spread,
     texture_table,
+    widened,
 )
 
 # Roulette by throughput begins where a path has lost 90 % of its weight. With the chance to go on equal to throughput / τ below τ, a
@@ -69,9 +68,6 @@ _INFINITE = np.float32(np.inf)
 _MAX_PASSED = 4096
 # Where a shadow ray goes on behind a hole: distances along one ray are accurate to about an ulp of themselves.
 _PASSED = 1 + 2.0**-20
-# A ray drawn with density p stands for 1/(N p) of solid angle (Colbert and Křivánek 2007, "GPU-Based Importance Sampling", GPU Gems 3).
-# N is what makes a ray straight up from a Lambert surface, p = 1/π, stand for as much as a texel of a 16 × 16 capture map.
-_LOBE_RAYS = 64.0
 
 
 class Tables(NamedTuple):
@@ -99,8 +95,7 @@ class Tables(NamedTuple):
     item_transform: NDArray[np.float64]
     item_normal: NDArray[np.float64]
     materials: MaterialTable
-    textures: TextureTable
-    alpha: AlphaTable
+    textures: TextureTable | None
     emitters: EmitterTable
     lights: LightTable
     environment: NDArray[np.float64]
@@ -140,7 +135,6 @@ class Tracer:
             item_normal=_normal_matrices(transforms[:, :, :3]),
             materials=material_table(scene),
             textures=texture_table(scene),
-            alpha=alpha_table(scene),
             emitters=emitter_table(scene),
             lights=light_table(lights, scene.bounds - scene.origin),
             environment=environment_radiance(spec),
@@ -262,35 +256,10 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def reflectance(t, s, width, cosine):
-    """Base colour (vertex colour included), metallic and roughness of a hit, averaged over the footprint of a ray this wide.
-
-    Returns
-    -------
-    red, green, blue, metallic, roughness : float64
-    """
-    color, material, triangle = s[3], s[4], s[6]
-    red = float(t.materials.albedo[material, 0]) * color[0]
-    green = float(t.materials.albedo[material, 1]) * color[1]
-    blue = float(t.materials.albedo[material, 2]) * color[2]
-    metallic, roughness = 0.0, 1.0
-    if t.textures.slots.shape[0]:
-        slots = t.textures.slots[material]
-        share = 2 * width * width / (max(cosine, 1e-3) * s[9]) if s[9] > 0 else 0.0
-        if slots[BASE_COLOR] >= 0:
-            r, g, b = look_up(t.textures, slots[BASE_COLOR], triangle, s[7], s[8], share)
-            red, green, blue = red * r, green * g, blue * b
-        if slots[METALLIC_ROUGHNESS] >= 0:
-            _, g, b = look_up(t.textures, slots[METALLIC_ROUGHNESS], triangle, s[7], s[8], share)
-            metallic, roughness = metallic * b, roughness * g
-    return red, green, blue, metallic, roughness
-
-
-@kernel
 def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
     """Whether anything lies between a point and the light: any hit, or hit after hit where something in the scene is cut out."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
-    if t.alpha.mode.shape[0] == 0:
+    if not has_holes(t):
         occluded1(t.handle, ray.ctypes.data, 0)
         return ray[8] < 0
     for _ in range(_MAX_PASSED):
@@ -300,7 +269,7 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
         item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
         triangle = t.item_first_triangle[item] + ray_bits[17]
         material = t.triangle_material[triangle]
-        if not lets_through(t.textures, t.alpha, material, triangle, float(ray[15]), float(ray[16]), ray_bits):
+        if not lets_through(t, material, triangle, float(ray[15]), float(ray[16]), ray_bits):
             return True
         beyond = np.float32(ray[8] * _PASSED)
         set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
@@ -355,11 +324,7 @@ def sample_emitter(t, px, py, pz, u, v, w):
         side = 1.0 if facing > 0 else -1.0
         if facing > 0 or (facing < 0 and e.double_sided[i]):
             material, triangle = e.material[i], e.triangle[i]
-            radiance = emission_at(t, material, triangle, float(b1), float(b2), 0.0)
-            if t.alpha.mode.shape[0]:
-                # Its own surface cannot block what leaves it, so the holes in it are counted here.
-                there = opacity(t.textures, t.alpha, material, triangle, float(b1), float(b2))
-                radiance = (there * radiance[0], there * radiance[1], there * radiance[2])
+            radiance = emission_left(t, material, triangle, float(b1), float(b2))
             if radiance[0] + radiance[1] + radiance[2] > 0:
                 pdf = pdf_emitter(t, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
     lift = side * _EPSILON * (abs(x) + abs(y) + abs(z))
@@ -413,7 +378,7 @@ def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: 
             break
         s = surface(t, ray_bits, ray, dx, dy, dz)
         seen = s[5] or not through_backs or t.materials.double_sided[s[4]]
-        if seen and (t.alpha.mode.shape[0] == 0 or not lets_through(t.textures, t.alpha, s[4], s[6], s[7], s[8], ray_bits)):
+        if seen and not lets_through(t, s[4], s[6], s[7], s[8], ray_bits):
             return True, s
         # Leave on the far side: the surface's normal looks back at us.
         ox, oy, oz = s[0][0] - s[2] * s[1][0], s[0][1] - s[2] * s[1][1], s[0][2] - s[2] * s[1][2]
@@ -518,8 +483,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b * gain * le_b
         if depth >= t.max_bounces:
             break
-        if t.textures.slots.shape[0]:
-            width += spread * math.sqrt(hx * hx + hy * hy + hz * hz)
+        width = widened(t, width, spread, math.sqrt(hx * hx + hy * hy + hz * hz))
         base_r, base_g, base_b, _, _ = reflectance(t, s, width, facing)
         beta_r *= base_r
         beta_g *= base_g
@@ -567,7 +531,6 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
         dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
         pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
-        if t.textures.slots.shape[0]:
-            spread = max(spread, math.sqrt(1 / (_LOBE_RAYS * max(pdf, 1e-3))))
+        spread = scattered_spread(t, spread, pdf)
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, emitter_pdf
