@@ -1,4 +1,4 @@
-"""The one module that touches OpenImageIO: EXR files out and in, PNG out, PNG and JPEG in."""
+"""The one module that touches OpenImageIO: EXR files out and in, PNG out, PNG and JPEG and Radiance HDR in."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ F32 = NDArray[np.float32]
 
 # What a picture's first bytes say it is, and the suffix by which OpenImageIO knows the format.
 _PICTURES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
+
+_RADIANCES = {b"\x76\x2f\x31\x01": ".exr", b"#?": ".hdr"}
+# An 8192 × 4096 sky: 400 MB as float32 RGB.
+_MAX_RADIANCE_TEXELS = 1 << 25
 
 # EXR files carry a date; a fixed one keeps them the same bytes for the same texels.
 _DATE = "2000:01:01 00:00:00"
@@ -87,6 +91,51 @@ def read_exr(path: Path, error: type[InputError], slug: str) -> tuple[F32, bool]
     if pixels is None:
         raise error(slug, complaint or "cannot be read", path.name)
     return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels), half
+
+
+def read_radiance(path: Path, error: type[InputError], slug: str, where: str) -> F32:
+    """Read an EXR or Radiance HDR, whatever its name, as linear RGB.
+
+    Returns
+    -------
+    pixels : (height, width, 3) float32
+        As stored, NaN and infinity too; a single luminance channel is spread over RGB, alpha and depth are left out.
+
+    Raises
+    ------
+    InputError
+        `error` with `slug` where it is neither, is broken, too large, or has no colour.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+    suffix = next((s for magic, s in _RADIANCES.items() if start.startswith(magic)), None)
+    if suffix is None:
+        raise error(slug, "is neither an EXR nor a Radiance HDR", where)
+    # OpenImageIO goes by the name, and a blob has none.
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / f"image{suffix}"
+        link.symlink_to(path.absolute())
+        source = oiio.ImageInput.open(str(link))
+        if source is None:
+            raise error(slug, _one_line(oiio.geterror() or "cannot be read"), where)
+        try:
+            spec = source.spec()
+            names = list(spec.channelnames)
+            if spec.width * spec.height * spec.depth > _MAX_RADIANCE_TEXELS:
+                raise error(slug, f"has {spec.width} × {spec.height} texels, more than 8192 × 4096", where)
+            if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
+                raise error(slug, "is a part cut out of a larger image; store the whole", where)
+            if not ({"R", "G", "B"} <= set(names) or names[0] == "Y"):
+                raise error(slug, f"has the channels {', '.join(names)}; give R, G and B, or Y", where)
+            pixels = source.read_image("float")
+            complaint = source.geterror()
+        finally:
+            source.close()
+    if pixels is None or complaint:
+        raise error(slug, _one_line(complaint or "cannot be read"), where)
+    chosen = [names.index(c) for c in "RGB"] if "R" in names else [0, 0, 0]
+    shaped = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    return np.ascontiguousarray(shaped[..., chosen])
 
 
 def picture_size(data: bytes, error: type[InputError], slug: str, where: str) -> tuple[int, int]:

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.errors import SpecError
 from bake_core.kernels import kernel
 from bake_core.scene import LIGHT_DIRECTIONAL, LIGHT_POINT, LIGHT_SPOT, Lights, Scene
-from bake_core.spec import ConstantEnvironment, DirectionalLight, PointLight, Spec
+from bake_core.spec import DirectionalLight, PointLight, Spec
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -170,19 +169,6 @@ def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
     if cdf.size:
         cdf[-1] = 1
     return EmitterTable(vertices, front / twice_area[:, None], material, number, double_sided, cdf, float(power.sum()), by_triangle)
-
-
-def environment_radiance(spec: Spec) -> F64:
-    """The constant environment's radiance, (3,) float64.
-
-    Raises
-    ------
-    SpecError
-        ``spec.unsupported`` for an equirectangular image.
-    """
-    if not isinstance(spec.environment, ConstantEnvironment):
-        raise SpecError("spec.unsupported", "equirectangular environments are not traced yet; give a constant one", "environment.kind")
-    return np.asarray(spec.environment.radiance, np.float64)
 
 
 @kernel

@@ -19,18 +19,31 @@ from numpy.typing import NDArray
 
 from bake_core import embree
 from bake_core.embree import intersect1, occluded1, set_ray
-from bake_core.kernels import kernel
+from bake_core.environment import Environment, Sky, environment_radiance, has_sky, sample_sky
+from bake_core.ggx_albedo import AlbedoTable
+from bake_core.kernels import either, kernel
 from bake_core.lights import (
     EmitterTable,
     LightTable,
     choose,
     emitter_table,
-    environment_radiance,
     light_table,
     merge_lights,
     toward_light,
 )
-from bake_core.materials import INV_PI, MaterialTable, lambert_cosine, material_table, sample_lambert
+from bake_core.materials import (
+    INV_PI,
+    MaterialTable,
+    gloss,
+    gloss_table,
+    is_glossy,
+    lambert_cosine,
+    material_table,
+    no_gloss,
+    sample_gloss,
+    sample_lambert,
+    scattered,
+)
 from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair, uniform_triangle
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
@@ -95,10 +108,12 @@ class Tables(NamedTuple):
     item_transform: NDArray[np.float64]
     item_normal: NDArray[np.float64]
     materials: MaterialTable
+    gloss: AlbedoTable | None
     textures: TextureTable | None
     emitters: EmitterTable
     lights: LightTable
     environment: NDArray[np.float64]
+    sky: Sky | None
     max_bounces: np.int64
 
 
@@ -113,8 +128,13 @@ class Tracer:
     triangle_count: int
 
     @classmethod
-    def build(cls, scene: Scene, spec: Spec) -> Tracer:
+    def build(cls, scene: Scene, spec: Spec, environment: Environment) -> Tracer:
         """Build the acceleration structure and the kernels' tables.
+
+        Parameters
+        ----------
+        environment : Environment
+            What :func:`bake_core.environment.read_environment` makes of the spec's.
 
         Raises
         ------
@@ -134,10 +154,12 @@ class Tracer:
             item_transform=transforms,
             item_normal=_normal_matrices(transforms[:, :, :3]),
             materials=material_table(scene),
+            gloss=gloss_table(scene),
             textures=texture_table(scene),
             emitters=emitter_table(scene),
             lights=light_table(lights, scene.bounds - scene.origin),
-            environment=environment_radiance(spec),
+            environment=environment.constant,
+            sky=environment.sky,
             max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
         )
         if emits_unevenly(scene):
@@ -278,14 +300,14 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
 
 
 @kernel
-def pdf_emitter(t, strength, two_sided, d2, facing):
+def pdf_emitter(t, strength, two_sided, d2, facing):  # type: ignore[no-untyped-def]
     """Per solid angle, of :func:`sample_emitter`, seen from a distance of √d2 under a cosine of `facing` at the emitter."""
     sides = 2.0 if two_sided else 1.0
     return strength * sides / t.emitters.total * d2 / max(facing, 1e-30)
 
 
 @kernel
-def emitter_strength(t, material, triangle):
+def emitter_strength(t, material, triangle):  # type: ignore[no-untyped-def]
     """What a triangle's part in the emitters' power is weighted by: its mean radiance, summed over channels."""
     if t.emitters.strength.shape[0]:
         return t.emitters.strength[triangle]
@@ -294,7 +316,7 @@ def emitter_strength(t, material, triangle):
 
 
 @kernel
-def sample_emitter(t, px, py, pz, u, v, w):
+def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
     """A point on the emissive triangles, chosen by power and area, as seen from a point.
 
     Pdf: :func:`pdf_emitter`.
@@ -333,36 +355,60 @@ def sample_emitter(t, px, py, pz, u, v, w):
 
 
 @kernel
-def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):
-    """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
+def from_emitters(t, ray, ray_bits, p, n, epsilon, glossy, look, u, v, w):  # type: ignore[no-untyped-def]
+    """Light from one point of one emissive triangle: radiance times :func:`scattered` over the sum of both techniques' pdfs.
 
-    The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
+    The balance heuristic's weight p_l / (p_l + p_b) is already in it.
     """
     radiance, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
-    cosine = lambert_cosine(d[0], d[1], d[2], n)
-    if pdf <= 0 or cosine <= 0:
+    if pdf <= 0:
+        return 0.0, 0.0, 0.0
+    fr, fg, fb, bsdf_pdf = scattered(t, glossy, look, d[0], d[1], d[2], n)
+    if fr + fg + fb <= 0:
         return 0.0, 0.0, 0.0
     # Both ends have left their surfaces, so that neither of them blocks.
     ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     if blocked(t, ray, ray_bits, ox, oy, oz, end[0] - ox, end[1] - oy, end[2] - oz, np.float32(1.0)):
         return 0.0, 0.0, 0.0
-    gain = cosine * INV_PI / (pdf + cosine * INV_PI)
-    return gain * radiance[0], gain * radiance[1], gain * radiance[2]
+    both = pdf + bsdf_pdf
+    return fr / both * radiance[0], fg / both * radiance[1], fb / both * radiance[2]
 
 
 @kernel
-def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-def]
-    """Light from one punctual or directional light, chosen by weight: Σ f cosθ E over albedo, unbiased."""
+def _from_sky(t, ray, ray_bits, p, n, epsilon, glossy, look, u, v):  # type: ignore[no-untyped-def]
+    radiance, d, pdf = sample_sky(t.sky, float(u), float(v))
+    fr, fg, fb, bsdf_pdf = scattered(t, glossy, look, d[0], d[1], d[2], n)
+    if fr + fg + fb <= 0:
+        return 0.0, 0.0, 0.0
+    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    if blocked(t, ray, ray_bits, ox, oy, oz, d[0], d[1], d[2], _INFINITE):
+        return 0.0, 0.0, 0.0
+    both = pdf + bsdf_pdf
+    return fr / both * radiance[0], fg / both * radiance[1], fb / both * radiance[2]
+
+
+# The same, from one direction of the sky.
+from_sky = either("sky")(_from_sky)(lambda t, ray, ray_bits, p, n, epsilon, glossy, look, u, v: (0.0, 0.0, 0.0))
+
+
+@kernel
+def from_lights(t, ray, ray_bits, p, n, epsilon, glossy, look, u):  # type: ignore[no-untyped-def]
+    """Light from one punctual or directional light, chosen by weight: Σ E times :func:`scattered`, unbiased."""
     i, chance = choose(t.lights.cdf, float(u))
     wx, wy, wz, distance, gain = toward_light(t.lights, i, p[0], p[1], p[2])
-    cosine = lambert_cosine(wx, wy, wz, n)
-    if gain <= 0 or cosine <= 0:
+    if gain <= 0:
+        return 0.0, 0.0, 0.0
+    fr, fg, fb, _ = scattered(t, glossy, look, wx, wy, wz, n)
+    if fr + fg + fb <= 0:
         return 0.0, 0.0, 0.0
     ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     if blocked(t, ray, ray_bits, ox, oy, oz, wx, wy, wz, np.float32(distance)):
         return 0.0, 0.0, 0.0
-    gain *= cosine * INV_PI / chance
-    return gain * t.lights.value[i, 0], gain * t.lights.value[i, 1], gain * t.lights.value[i, 2]
+    return (
+        gain * (fr / chance) * t.lights.value[i, 0],
+        gain * (fg / chance) * t.lights.value[i, 1],
+        gain * (fb / chance) * t.lights.value[i, 2],
+    )
 
 
 @kernel
@@ -387,7 +433,7 @@ def find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, through_backs):  # type: 
 
 
 @kernel
-def sample_pair(reversed_index, index, depth, key):
+def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-def]
     """Two sample coordinates of a path's vertex: stratified at the first vertices, plain random numbers after."""
     if depth <= STRATIFIED_VERTICES:
         return sobol_pair(reversed_index, key)
@@ -422,8 +468,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Reflected at the first surface, all the rest.
     hit : bool
         Whether the ray met a surface.
-    emitter_pdf : float64
-        With which density :func:`sample_emitter` would have found what the ray met; 0 where it is no emissive triangle.
+    light_pdf : float64
+        With which density :func:`sample_emitter` or :func:`bake_core.environment.sample_sky` would have found what the ray met; 0 where
+        neither could.
     """
     emitted_r = emitted_g = emitted_b = 0.0
     direct_r = direct_g = direct_b = 0.0
@@ -436,29 +483,32 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     pdf = 0.0
     width = 0.0
     hit_any = False
-    emitter_pdf = 0.0
+    light_pdf = 0.0
     depth = 0
     has_emitters = t.emitters.cdf.shape[0] > 0
     has_lights = t.lights.cdf.shape[0] > 0
-    sky = t.environment[0] + t.environment[1] + t.environment[2] > 0
+    shines = has_sky(t) or t.environment[0] + t.environment[1] + t.environment[2] > 0
+    look = no_gloss(t)
     needs_choice = t.emitters.cdf.shape[0] > 1 or t.lights.cdf.shape[0] > 1
     while True:
         if depth > 0 and depth >= t.max_bounces and not has_emitters:
             # The last ray can only find the environment: whether anything is in the way is a cheaper question than what.
-            if sky and not blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE):
-                indirect_r += beta_r / survival * t.environment[0]
-                indirect_g += beta_g / survival * t.environment[1]
-                indirect_b += beta_b / survival * t.environment[2]
-            break
-        hit, s = find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, camera and depth == 0)
+            hit = not shines or blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE)
+            if hit:
+                break
+        else:
+            hit, s = find_hit(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, camera and depth == 0)
         if not hit:
             # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
+            radiance, sky_pdf = environment_radiance(t, dx, dy, dz)
             if depth == 0:
-                emitted_r, emitted_g, emitted_b = t.environment[0], t.environment[1], t.environment[2]
+                emitted_r, emitted_g, emitted_b = radiance
+                light_pdf = sky_pdf
             else:
-                indirect_r += beta_r / survival * t.environment[0]
-                indirect_g += beta_g / survival * t.environment[1]
-                indirect_b += beta_b / survival * t.environment[2]
+                gain = pdf / (pdf + sky_pdf)
+                indirect_r += beta_r / survival * (gain * radiance[0])
+                indirect_g += beta_g / survival * (gain * radiance[1])
+                indirect_b += beta_b / survival * (gain * radiance[2])
             break
         p, n, epsilon, _, material, front, triangle, b1, b2, _ = s
         two_sided = t.materials.double_sided[material]
@@ -475,7 +525,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             strength = emitter_strength(t, material, triangle)
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
-                emitter_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
+                light_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
             else:
                 gain = pdf / (pdf + pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)) / survival
                 indirect_r += beta_r * gain * le_r
@@ -484,10 +534,14 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         if depth >= t.max_bounces:
             break
         width = widened(t, width, spread, math.sqrt(hx * hx + hy * hy + hz * hz))
-        base_r, base_g, base_b, _, _ = reflectance(t, s, width, facing)
-        beta_r *= base_r
-        beta_g *= base_g
-        beta_b *= base_b
+        base_r, base_g, base_b, metallic, roughness = reflectance(t, s, width, facing)
+        glossy = is_glossy(t, metallic, roughness)
+        if glossy:
+            look = gloss(t, (base_r, base_g, base_b), metallic, roughness, dx, dy, dz, n)
+        else:
+            beta_r *= base_r
+            beta_g *= base_g
+            beta_b *= base_b
         most = max(beta_r, beta_g, beta_b)
         if most <= 0:
             break
@@ -498,7 +552,15 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             choice, _ = sample_pair(reversed_index, index, depth, vertex + uint64(1))
         if has_emitters:
             light_u, light_v = sample_pair(reversed_index, index, depth, vertex + uint64(2))
-            r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, light_u, light_v, choice)
+            r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, glossy, look, light_u, light_v, choice)
+            if r + g + b > 0:
+                dark = 0
+                indirect_r += beta_r / survival * r
+                indirect_g += beta_g / survival * g
+                indirect_b += beta_b / survival * b
+        if has_sky(t):
+            light_u, light_v = sample_pair(reversed_index, index, depth, vertex + uint64(4))
+            r, g, b = from_sky(t, ray, ray_bits, p, n, epsilon, glossy, look, light_u, light_v)
             if r + g + b > 0:
                 dark = 0
                 indirect_r += beta_r / survival * r
@@ -506,7 +568,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b / survival * b
         if has_lights:
             # Emitters and punctual lights may share a number: each sum stays unbiased, and no product of the two is taken.
-            r, g, b = from_lights(t, ray, ray_bits, p, n, epsilon, choice)
+            r, g, b = from_lights(t, ray, ray_bits, p, n, epsilon, glossy, look, choice)
             if r + g + b > 0:
                 dark = 0
                 if depth == 1:
@@ -515,8 +577,19 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                     indirect_r += beta_r / survival * r
                     indirect_g += beta_g / survival * g
                     indirect_b += beta_b / survival * b
+        bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
+        if glossy:
+            dx, dy, dz = sample_gloss(t, look, float(bsdf_u), float(bsdf_v), n)
+            fr, fg, fb, pdf = scattered(t, glossy, look, dx, dy, dz, n)
+            if fr + fg + fb <= 0:
+                break
+            beta_r *= fr / pdf
+            beta_g *= fg / pdf
+            beta_b *= fb / pdf
+            most = max(beta_r, beta_g, beta_b)
         go_on = 1.0
-        if most < ROULETTE_THROUGHPUT:
+        # A gloss may weigh more than 1 in a direction that is seldom drawn: what roulette took away it does not give back.
+        if most < ROULETTE_THROUGHPUT * by_throughput:
             go_on = most / ROULETTE_THROUGHPUT / by_throughput
             by_throughput = most / ROULETTE_THROUGHPUT
         if dark > ROULETTE_DARK_VERTICES:
@@ -528,9 +601,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             if roulette >= go_on:
                 break
             survival *= go_on
-        bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
-        dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
-        pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+        if not glossy:
+            dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
+            pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
         spread = scattered_spread(t, spread, pdf)
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, emitter_pdf
+    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, light_pdf

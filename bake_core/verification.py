@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bake_core.automatic_cameras import automatic_cameras
 from bake_core.bundle import Bundle, content_digest, dump_json
 from bake_core.comparison import Figures, compare
+from bake_core.environment import no_images, read_environment
 from bake_core.errors import BundleError, InputError
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
@@ -90,7 +91,7 @@ def verify(
     spec = _check_bundle(bundle, scene)
     tell = _Teller(progress)
     tell("building", 0.0)
-    tracer = Tracer.build(scene, spec)
+    tracer = Tracer.build(scene, spec, read_environment(spec.environment, no_images)[0])
     work = out.with_name(f".{out.name}.{uuid.uuid4().hex}")
     work.mkdir()
     try:
