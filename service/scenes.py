@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from bake_core.gltf.reader import load_scene_files
 from bake_core.scene import Scene
+from bake_core.scene_files import load_scene_files
 from service.blobs import Blobs
 
 # Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.

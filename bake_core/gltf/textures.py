@@ -75,8 +75,8 @@ class Textures:
         source = texture.value.get("source")
         if source is None:
             others = ", ".join(map(quoted, texture.child("extensions").value))
-            text = f"has no PNG or JPEG, only what {others} names" if others else "has no source"
-            fail("unsupported_image", f"{text}; convert it to PNG or JPEG", texture.where)
+            only = f", only what {others} names" if others else ""
+            fail("unsupported_image", f"a texture without PNG or JPEG{only}; convert it to PNG or JPEG", texture.where)
         wrap, nearest = ((WRAP_REPEAT, WRAP_REPEAT), False)
         if "sampler" in texture:
             sampler = texture.value["sampler"]
@@ -120,7 +120,7 @@ class Textures:
             return self._document.resources.get(image.text("uri"), image.place("uri"))
         kind = image.text("mimeType")
         if kind not in TYPES:
-            fail("unsupported_image", f"is {quoted(kind)}, must be {' or '.join(TYPES)}", image.place("mimeType"))
+            fail("unsupported_image", f"an image of type {quoted(kind)}; convert it to PNG or JPEG", image.place("mimeType"))
         return self._accessors.view_bytes(image.value["bufferView"])
 
 

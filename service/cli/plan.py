@@ -23,8 +23,8 @@ def run(args: argparse.Namespace) -> int:
     """Print the plan."""
     from dataclasses import asdict
 
-    from bake_core.gltf.reader import load_scene
     from bake_core.plan import plan
+    from bake_core.scene_files import load_scene
     from bake_core.spec import load_spec
 
     spec = load_spec(args.spec)

@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core.bundle import read_bundle
     from bake_core.cameras import load_cameras
-    from bake_core.gltf.reader import load_scene
+    from bake_core.scene_files import load_scene
     from bake_core.thresholds import load_thresholds
     from bake_core.verification import verify
     from service.cli.progress import ProgressLine

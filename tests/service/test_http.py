@@ -127,7 +127,7 @@ def test_a_glb_is_read_and_what_is_in_it_is_told(http: InProcess) -> None:
 
 
 def test_a_scene_of_files_has_the_digest_that_the_command_line_gives_it(http: InProcess, tmp_path: Any) -> None:
-    from bake_core.gltf.reader import load_scene
+    from bake_core.scene_files import load_scene
 
     positions = b"".join(int(v).to_bytes(4, "little") for v in (0, 0, 0, 0x3F800000, 0, 0, 0, 0x3F800000, 0))
     gltf = {
