@@ -82,9 +82,10 @@ def _refused() -> Iterator[tuple[str, str, str]]:
     yield "any other extension in `extensionsRequired`", "`gltf.unsupported_extension`", ""
     for call in _tuples_and_calls():
         slug = call[0]
-        if isinstance(slug, ast.Constant) and str(slug.value).startswith("unsupported_") and slug.value != "unsupported_extension":
+        name = _text(slug)
+        if name.startswith("unsupported_") and name != "unsupported_extension":
             what, _, instead = _text(call[1]).partition("; ")
-            yield what, f"`gltf.{slug.value}`", instead
+            yield what, f"`gltf.{name}`", instead
 
 
 def _calls() -> Iterator[ast.Call]:
