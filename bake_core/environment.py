@@ -66,6 +66,8 @@ def beside(folder: Path) -> Find:
             raise SpecError(
                 "spec.image_not_found", "only a service knows images by digest; give a path from the spec file", "environment.image"
             )
+        if not (folder / image).is_file():
+            raise SpecError("spec.image_not_found", f"there is no file {image!r} beside the spec", "environment.image")
         return folder / image
 
     return find

@@ -6,11 +6,14 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from bake_core.environment import Find
+from bake_core.errors import BakeError, SpecError
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene_files
-from service.blobs import Blobs
+from service.blobs import DIGEST, Blobs
 
 # Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
 KEPT_OUTLINES = 64
@@ -19,6 +22,22 @@ KEPT_OUTLINES = 64
 def load_stored(blobs: Blobs, scene: Mapping[str, Any]) -> Scene:
     """Read a scene from its row's ``root`` and ``files``; the reader checks it again, for a worker takes nobody's word."""
     return load_scene_files(scene["root"], {name: blobs.local_path(digest) for name, digest in scene["files"].items()})
+
+
+def find_stored(blobs: Blobs) -> Find:
+    """Images that a spec names, from the blob store: by digest only, for paths are the sender's."""
+
+    def find(image: str) -> Path:
+        if not DIGEST.fullmatch(image):
+            raise SpecError(
+                "spec.image_not_found", f"{image!r} is not sha256:HEX; put the image as a blob and name it so", "environment.image"
+            )
+        try:
+            return blobs.local_path(image)
+        except (BakeError, FileNotFoundError):
+            raise SpecError("spec.image_not_found", f"there is no blob {image}; put it with PUT /v1/blobs", "environment.image") from None
+
+    return find
 
 
 class Outlines:

@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core import bundle
     from bake_core.bake import bake
+    from bake_core.environment import beside
     from bake_core.report import percent
     from bake_core.spec import load_spec
     from service.cli.progress import ProgressLine
@@ -45,7 +46,16 @@ def run(args: argparse.Namespace) -> int:
     previous = signal.signal(signal.SIGINT, lambda *_: cancelled.fill(1))
     line = ProgressLine(sys.stderr)
     try:
-        result = bake(args.scene, spec, args.out, threads=args.threads, shards=args.shards, progress=line, cancelled=cancelled)
+        result = bake(
+            args.scene,
+            spec,
+            args.out,
+            threads=args.threads,
+            shards=args.shards,
+            find=beside(args.spec.parent),
+            progress=line,
+            cancelled=cancelled,
+        )
     finally:
         line.close()
         signal.signal(signal.SIGINT, previous)

@@ -23,12 +23,13 @@ def run(args: argparse.Namespace) -> int:
     """Print the plan."""
     from dataclasses import asdict
 
+    from bake_core.environment import beside
     from bake_core.plan import plan
     from bake_core.scene_files import load_scene
     from bake_core.spec import load_spec
 
     spec = load_spec(args.spec)
-    made = plan(load_scene(args.scene), spec, threads=args.threads)
+    made = plan(load_scene(args.scene), spec, threads=args.threads, find=beside(args.spec.parent))
     if args.json:
         print(json.dumps(asdict(made), indent=2))
         return 0

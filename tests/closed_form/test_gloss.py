@@ -55,13 +55,11 @@ def test_a_white_sphere_cannot_be_seen_under_a_white_sky(tmp_path: Path, metalli
     assert abs(radiance.mean() - 1) < 1e-3
 
 
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
-@pytest.mark.parametrize("roughness", [0.05, 0.5, 1.0])
+@pytest.mark.parametrize(("metallic", "roughness"), [(0.0, 0.05), (0.0, 0.5), (1.0, 0.05), (1.0, 0.5), (1.0, 1.0)])
 def test_a_closed_white_box_with_some_bounces(tmp_path: Path, metallic: float, roughness: float) -> None:
     """Walls of reflectance 1 that emit Le: after k bounces π·Le·(k + 1)."""
-    if (metallic, roughness) == (0.0, 1.0):
-        pytest.skip("that is Lambert")
-    bundle = bake_example(tmp_path, closed_box(1.0, 0.7, 3, metallic=metallic, roughness=roughness))
+    example = closed_box(1.0, 0.7, 3, metallic=metallic, roughness=roughness)
+    bundle = bake_example(tmp_path, example, resolution={"radiance": 16}, outputs=["irradiance"])
     expected = math.pi * float(np.float32(0.7)) * 4
     texels = maps(bundle)
     assert abs(texels.mean() / expected - 1) < 2e-3

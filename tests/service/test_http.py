@@ -287,6 +287,22 @@ def test_a_list_that_cannot_be(http: InProcess, query: str, where: str) -> None:
     assert problem(http.get(f"/v1/bakes?{query}"), 422, "request.invalid")["where"] == where
 
 
+def test_a_sky_is_a_blob(http: InProcess) -> None:
+    """Named by digest, and there before the bake is; a path would be the service's own."""
+    blob = b"any bytes: they are read when the bake is"
+    image = "sha256:" + hashlib.sha256(blob).hexdigest()
+    scene = add_box(http)
+
+    def answer(image: str) -> Any:
+        spec = {**box_spec(), "environment": {"kind": "equirect", "image": image}}
+        return http.post("/v1/bakes", json={"scene": scene, "spec": spec})
+
+    for absent in ("sky.exr", "/etc/hostname", "sha256:../../etc", image):
+        problem(answer(absent), 422, "spec.image_not_found")
+    assert http.put(f"/v1/blobs/{image}", content=blob).status_code == 201
+    assert answer(image).status_code == 202
+
+
 def test_a_queued_bake_is_cancelled_at_once_and_for_good(http: InProcess) -> None:
     job = submit(http)["id"]
     assert http.post(f"/v1/bakes/{job}:cancel").json()["state"] == "cancelled"
