@@ -95,6 +95,17 @@ def merge_lights(scene: Scene, spec: Spec) -> Lights:
     )
 
 
+def cone_ramps(lights: Lights) -> F64:
+    """Scale and offset of each light's cone, (n, 2): by KHR_lights_punctual it is dimmed by saturate(cosθ · scale + offset)².
+
+    The extension's sample code keeps cos inner - cos outer above 0.001, which would darken every spot narrower than 2.5° to nothing much;
+    here only cosines that float32 cannot tell apart are held off each other, and make a hard edge.
+    """
+    inner, outer = lights.cos_inner.astype(np.float64), lights.cos_outer.astype(np.float64)
+    scale = 1 / np.maximum(2.0**-22, inner - outer)
+    return np.stack([scale, -outer * scale], 1)
+
+
 def light_table(lights: Lights, bounds: F64) -> LightTable:
     """The kernels' view of punctual lights.
 
@@ -110,9 +121,6 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
     weight = np.where(lights.kind == LIGHT_DIRECTIONAL, strength, strength / typical)
     shining = weight > 0
     weight = weight[shining]
-    inner, outer = lights.cos_inner[shining].astype(np.float64), lights.cos_outer[shining].astype(np.float64)
-    # KHR_lights_punctual: attenuation = saturate(cosθ · scale + offset)², scale = 1 / max(0.001, cos inner - cos outer).
-    scale = 1 / np.maximum(0.001, inner - outer)
     cdf = np.cumsum(weight / weight.sum()) if weight.size else np.zeros(0)
     if cdf.size:
         cdf[-1] = 1
@@ -121,7 +129,7 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
         lights.position[shining].astype(np.float64),
         lights.direction[shining].astype(np.float64),
         lights.value[shining].astype(np.float64),
-        np.stack([scale, -outer * scale], 1),
+        cone_ramps(lights)[shining],
         lights.range[shining].astype(np.float64),
         cdf,
     )

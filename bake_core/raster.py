@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.bundle import VolumeData
+from bake_core.lights import cone_ramps
 from bake_core.picture import Picture
 from bake_core.probe_textures import probe_module, probe_textures
 from bake_core.scene import Camera, Lights, Scene
@@ -277,8 +278,7 @@ def _light_rows(lights: Lights, groups: Sequence[Batch]) -> F32:
     rows[:, 0, :3], rows[:, 0, 3] = lights.position, lights.kind
     rows[:, 1, :3], rows[:, 1, 3] = lights.direction, lights.range
     rows[:, 2, :3] = lights.value
-    scale = 1 / np.maximum(0.001, lights.cos_inner.astype(np.float64) - lights.cos_outer)
-    rows[:, 3, 0], rows[:, 3, 1] = scale, -lights.cos_outer * scale
+    rows[:, 3, :2] = cone_ramps(lights)
     for batch in groups:
         rows[batch.first : batch.last, 2, 3] = batch.first_view
         rows[batch.first : batch.last, 3, 2] = batch.view_count
