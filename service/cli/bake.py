@@ -12,7 +12,7 @@ from pathlib import Path
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("bake", help="bake a scene here, with no server")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb or .gltf")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf, a zip of its folder, .obj, .ply or .stl")
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True, help="JSON file: volumes, lights, environment, when to stop")
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, required=True, help="a folder, or a zip where it ends in .zip")
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")

@@ -12,7 +12,7 @@ from service.cli.bake import positive
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("plan", help="what will be baked and left out, with predicted seconds, memory and bytes")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb or .gltf")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf, a zip of its folder, .obj, .ply or .stl")
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True)
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="threads that the bake will have; default: all cores")
     parser.add_argument("--json", action="store_true", help="print one JSON document")

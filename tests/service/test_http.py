@@ -13,6 +13,7 @@ import pytest
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
+from tests.faults.corpus import make_zip
 from tests.service.running import BOX, InProcess, box_spec
 
 HEX = hashlib.sha256(BOX).hexdigest()
@@ -124,6 +125,14 @@ def test_a_glb_is_read_and_what_is_in_it_is_told(http: InProcess) -> None:
     assert answer.headers["location"] == f"/v1/scenes/{DIGEST}"
     assert http.get(answer.headers["location"]).json() == document
     assert http.post("/v1/scenes", content=BOX).status_code == 200
+
+
+def test_a_zip_is_the_scene_that_it_holds(http: InProcess) -> None:
+    packed = make_zip({"room/box.glb": BOX})
+    answer = http.post("/v1/scenes", content=packed, headers={"content-type": "application/zip"})
+    assert (answer.status_code, answer.json()["digest"]) == (201, DIGEST), answer.text
+    assert http.post("/v1/bakes", json={"scene": DIGEST, "spec": box_spec()}).status_code == 202
+    problem(http.post("/v1/scenes", content=packed[:-9], headers={"content-type": "application/zip"}), 422, "scene.bad_zip")
 
 
 def test_a_scene_of_files_has_the_digest_that_the_command_line_gives_it(http: InProcess, tmp_path: Any) -> None:
