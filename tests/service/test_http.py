@@ -13,6 +13,7 @@ import pytest
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
+from tests.faults.corpus import make_zip
 from tests.service.running import BOX, InProcess, box_spec
 
 HEX = hashlib.sha256(BOX).hexdigest()
@@ -126,8 +127,16 @@ def test_a_glb_is_read_and_what_is_in_it_is_told(http: InProcess) -> None:
     assert http.post("/v1/scenes", content=BOX).status_code == 200
 
 
+def test_a_zip_is_the_scene_that_it_holds(http: InProcess) -> None:
+    packed = make_zip({"room/box.glb": BOX})
+    answer = http.post("/v1/scenes", content=packed, headers={"content-type": "application/zip"})
+    assert (answer.status_code, answer.json()["digest"]) == (201, DIGEST), answer.text
+    assert http.post("/v1/bakes", json={"scene": DIGEST, "spec": box_spec()}).status_code == 202
+    problem(http.post("/v1/scenes", content=packed[:-9], headers={"content-type": "application/zip"}), 422, "scene.bad_zip")
+
+
 def test_a_scene_of_files_has_the_digest_that_the_command_line_gives_it(http: InProcess, tmp_path: Any) -> None:
-    from bake_core.gltf.reader import load_scene
+    from bake_core.scene_files import load_scene
 
     positions = b"".join(int(v).to_bytes(4, "little") for v in (0, 0, 0, 0x3F800000, 0, 0, 0, 0x3F800000, 0))
     gltf = {
@@ -299,6 +308,22 @@ def test_lists_are_paged_and_filtered(http: InProcess) -> None:
 )
 def test_a_list_that_cannot_be(http: InProcess, query: str, where: str) -> None:
     assert problem(http.get(f"/v1/bakes?{query}"), 422, "request.invalid")["where"] == where
+
+
+def test_a_sky_is_a_blob(http: InProcess) -> None:
+    """Named by digest, and there before the bake is; a path would be the service's own."""
+    blob = b"any bytes: they are read when the bake is"
+    image = "sha256:" + hashlib.sha256(blob).hexdigest()
+    scene = add_box(http)
+
+    def answer(image: str) -> Any:
+        spec = {**box_spec(), "environment": {"kind": "equirect", "image": image}}
+        return http.post("/v1/bakes", json={"scene": scene, "spec": spec})
+
+    for absent in ("sky.exr", "/etc/hostname", "sha256:../../etc", image):
+        problem(answer(absent), 422, "spec.image_not_found")
+    assert http.put(f"/v1/blobs/{image}", content=blob).status_code == 201
+    assert answer(image).status_code == 202
 
 
 def test_a_queued_bake_is_cancelled_at_once_and_for_good(http: InProcess) -> None:
