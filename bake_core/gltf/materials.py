@@ -41,9 +41,7 @@ class Row:
     emissive_texture: int = NO_TEXTURE
 
 
-def read_materials(
-    root: Fields, used: Collection[int | None], textures: Textures, notes: Notes
-) -> tuple[Materials, dict[int | None, int]]:
+def read_materials(root: Fields, used: Collection[int | None], textures: Textures, notes: Notes) -> tuple[Materials, dict[int | None, int]]:
     """The materials in `used`, in the file's order; None stands for glTF's default material, and comes last.
 
     Returns

@@ -13,7 +13,7 @@ from service.cli.remote import add_json, add_server, connect, exit_code, follow
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command."""
     parser = commands.add_parser("submit", help="queue a bake on a service")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf with its files beside it, a zip of its folder, .obj, .ply or .stl")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf with its files, a zip of its folder, .obj, .ply or .stl")
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True)
     parser.add_argument("--label", metavar="KEY=VALUE", action="append", default=[], type=_label, help="may be given several times")
     parser.add_argument("--priority", metavar="N", type=int, default=0, help="higher goes first")

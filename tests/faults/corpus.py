@@ -597,6 +597,7 @@ def _texture_faults() -> Iterator[Fault]:
         ("images/0/bufferView", "images[0].bufferView"),
     ):
         yield of(f"{where} out of range", "index_out_of_range", where, (path, 7))
+    value: Any
     for path, where, value in (
         (f"{texture}/texCoord", f"{base}.texCoord", -1),
         ("samplers/0/wrapS", "samplers[0].wrapS", 10496),

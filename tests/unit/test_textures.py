@@ -47,8 +47,8 @@ def textured(
     texture = w.texture(png(pixels), **sampler)
     if info:
         texture = w.transformed(texture, **info)
-    more: dict[str, Any] = {"emission": (1, 1, 1)} if slot == "emissive_texture" else {}
-    material = w.material("m", **{slot: texture}, **more)
+    look: dict[str, Any] = {slot: texture} | ({"emission": (1, 1, 1)} if slot == "emissive_texture" else {})
+    material = w.material("m", **look)
     w.node(mesh=w.mesh("square", [Part(SQUARE, FACES, uvs=[CORNERS], material=material)]))
     return load_glb(w.to_glb(), folder)
 
@@ -130,10 +130,10 @@ def test_every_level_keeps_the_mean(size: tuple[int, int], srgb: bool) -> None:
     levels = pyramid(Image("i", noise(*size)), srgb, 0.0)
     assert levels[-1].shape[:2] == (1, 1)
     assert [max(1, n // 2) for n in levels[0].shape[:2]] == list(levels[min(1, len(levels) - 1)].shape[:2])
-    decode = srgb_to_linear if srgb else (lambda v: v)
-    means = [decode(level[..., :3] / 65535).mean((0, 1)) for level in levels]
+    linear = [level[..., :3] / 65535 for level in levels]
+    means = np.array([(srgb_to_linear(v) if srgb else v).mean((0, 1)) for v in linear])
     # Half a code of 16 bits, a level at most.
-    np.testing.assert_allclose(means, means[0][None].repeat(len(means), 0), atol=4e-5)
+    np.testing.assert_allclose(means, np.broadcast_to(means[0], means.shape), atol=4e-5)
 
 
 @pytest.mark.parametrize("cutoff", [0.5, -1.0])
@@ -162,7 +162,7 @@ def test_texture_transform_of_the_specification_s_example(tmp_path: Path) -> Non
     m = np.array(scene.textures[0].transform)
     found = np.array(CORNERS) @ m[:, :2].T + m[:, 2]
     # Image coordinates have v = 1 at the bottom. Its top left corner stands where the quadrant's bottom left was.
-    np.testing.assert_allclose(found, [[0, 1], [0, 0.5], [0.5, 0.5], [0.5, 1]], atol=1e-9)
+    np.testing.assert_allclose(found, np.array([[0, 1], [0, 0.5], [0.5, 0.5], [0.5, 1]]), atol=1e-9)
 
 
 def test_sets_of_coordinates_are_those_that_textures_name(tmp_path: Path) -> None:
