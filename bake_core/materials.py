@@ -41,9 +41,8 @@ def material_table(scene: Scene) -> MaterialTable:
         ``scene.unsupported`` where a material in use is not exactly Lambert.
     """
     m = scene.materials
-    used = np.zeros(len(m.name), bool)
-    used[np.unique(scene.triangle_material)] = True
-    for i in np.flatnonzero(used & ((m.metallic != 0) | (m.roughness != 1))):
+    # The reader keeps only materials in use.
+    for i in np.flatnonzero((m.metallic != 0) | (m.roughness != 1)):
         raise SceneError(
             "scene.unsupported",
             f"metallic {m.metallic[i]:g}, roughness {m.roughness[i]:g}: only Lambert (metallic 0, roughness 1) is traced yet; "

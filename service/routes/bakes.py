@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
+from bake_core.lights import environment_radiance
+from bake_core.materials import material_table
 from bake_core.placement import place
 from bake_core.spec import parse_spec
 from service import documents
@@ -38,8 +40,11 @@ def create_bake(body: documents.BakeRequest, service: Here, response: Response) 
     scene = service.store.scene(body.scene)
     if scene is None:
         raise RequestError("scene.unknown", f"there is no scene {body.scene}; add it with POST /v1/scenes", "body.scene", 422)
-    # Volumes that do not fit this scene are refused now, not after a wait in the queue.
-    place(service.outlines.get(body.scene, scene), spec)
+    # What cannot be baked is refused now, not after a wait in the queue: volumes that do not fit, materials and skies that are not traced.
+    outline = service.outlines.get(body.scene, scene)
+    place(outline, spec)
+    material_table(outline)
+    environment_radiance(spec)
     job = service.store.add_job(Kind.BAKE, {"scene": body.scene, "spec": spec.canonical()}, body.labels, body.priority)
     accepted(service, response, job, PATH)
     return _document(service, job, False)

@@ -8,8 +8,10 @@ import json
 from collections.abc import AsyncIterator
 from typing import Any
 
+import numpy as np
 import pytest
 
+from bake_core.gltf.writer import GlbWriter, Part
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
@@ -319,6 +321,18 @@ def test_unknown_not_yet_and_never_are_different(http: InProcess, service: Servi
     answer = http.get(f"/v1/bakes/{job}/bundle")
     problem(answer, 409, "job.no_result")
     assert "retry-after" not in answer.headers
+
+
+def test_what_is_not_traced_is_refused_before_it_is_queued(http: InProcess) -> None:
+    w = GlbWriter()
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
+    metal = w.material("chrome", (1, 1, 1), metallic=1.0, roughness=0.2)
+    w.node("wall", mesh=w.mesh("wall", [Part(square, np.array([[0, 1, 2], [0, 2, 3]]), material=metal)]))
+    scene = http.post("/v1/scenes", content=w.to_glb(), headers={"content-type": "model/gltf-binary"}).json()["digest"]
+    spec = {"volumes": [{"origin": [0, 0, 1], "spacing": [1, 1, 1], "counts": [1, 1, 1]}]}
+    refused = problem(http.post("/v1/bakes", json={"scene": scene, "spec": spec}), 422, "scene.unsupported")
+    assert "chrome" in refused["where"]
+    assert http.get("/v1/bakes").json()["items"] == []
 
 
 def test_a_verification_needs_a_finished_bake(http: InProcess, service: Service) -> None:
