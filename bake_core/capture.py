@@ -32,8 +32,7 @@ SCRAMBLES = 4
 # of threads.
 BLOCKS = 4
 # Emitters seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses it,
-# and the
-# edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.03 %.
+# and the edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.05 %.
 _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
