@@ -26,13 +26,14 @@ from bake_core.assemble import assemble
 from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, Verdict, decide, fit_pass, next_pass
+from bake_core.environment import Find, no_images, read_environment
 from bake_core.errors import MachineError
 from bake_core.filtering import visibility_moments
-from bake_core.gltf.reader import load_scene
 from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
 from bake_core.scene import Scene
+from bake_core.scene_files import load_scene
 from bake_core.selection import Selection, select
 from bake_core.spec import Spec
 from bake_core.tally import State, Tally
@@ -67,20 +68,27 @@ class Prepared:
         return len(self.positions)
 
 
-def prepare(scene: Scene, spec: Spec) -> Prepared:
+def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     """Place the probes, choose the outputs, build the acceleration structure.
+
+    Parameters
+    ----------
+    find : callable, optional
+        Where an image that the spec names lies; in what is prepared it is named by its digest.
 
     Raises
     ------
     SpecError, SceneError
     """
     volumes = place(scene, spec)
+    environment, named = read_environment(spec.environment, find)
+    spec = spec.model_copy(update={"environment": named})
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
         selection=select(scene, spec),
-        tracer=Tracer.build(scene, spec),
+        tracer=Tracer.build(scene, spec, environment),
         positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
     )
@@ -252,6 +260,7 @@ def bake(
     *,
     threads: int = 1,
     shards: int = 1,
+    find: Find = no_images,
     progress: ProgressCallback | None = None,
     cancelled: NDArray[np.uint8] | None = None,
 ) -> BakeResult:
@@ -265,6 +274,8 @@ def bake(
         A folder, or a zip where it ends in .zip; an existing one is replaced only if it is a bundle.
     threads, shards : int
         How the work is split; the bundle does not depend on it.
+    find : callable, optional
+        Where an image that the spec names lies.
 
     Raises
     ------
@@ -278,7 +289,7 @@ def bake(
     clock.stage("reading")
     scene = load_scene(scene_path)
     clock.stage("building")
-    prepared = prepare(scene, spec)
+    prepared = prepare(scene, spec, find)
     clock.stage("compiling")
     compile_kernels(prepared)
     clock.stage("tracing")

@@ -17,11 +17,13 @@ from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.embree import intersect1, new_rayhit, set_ray
+from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
-from bake_core.kernels import entry_kernel, kernel
+from bake_core.kernels import either, entry_kernel, kernel
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
-from bake_core.transport import Tracer, blocked, sample_emitter, surface, trace_path
+from bake_core.textures import lets_through
+from bake_core.transport import MAX_PASSED, Tracer, blocked, sample_emitter, surface, trace_path
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -31,19 +33,50 @@ SCRAMBLES = 4
 # A probe's capture texels are summed in this many blocks, which threads may share: fixed, so that sums are the same bits for any number
 # of threads.
 BLOCKS = 4
-# Emitters seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses it,
-# and the edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.05 %.
+# Emitters and sky seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses
+# it, and the edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.05 %.
 _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
+_INFINITE = np.float32(np.inf)
 _CANCELLED, _DONE = 1, 0
 # geomID of a ray that has met nothing.
 _NOTHING = 0xFFFFFFFF
 
 
 @kernel
-def _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance):  # type: ignore[no-untyped-def]
-    """Irradiance straight from emitters, one light sample a round; its weight is what the balance heuristic leaves to light samples.
+def _add_light(gain, radiance, d, normals, lanes):  # type: ignore[no-untyped-def]
+    """Radiance from a direction into the irradiance about every normal."""
+    fr, fg, fb = np.float32(gain * radiance[0]), np.float32(gain * radiance[1]), np.float32(gain * radiance[2])
+    fx, fy, fz = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
+    for i in range(normals.shape[1]):
+        f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
+        lanes[0, i] += f * fr
+        lanes[1, i] += f * fg
+        lanes[2, i] += f * fb
+
+
+@kernel
+def _capture_density(d, texels):  # type: ignore[no-untyped-def]
+    """Of capture rays in a unit direction, a round; its 1-norm takes it onto the octahedron."""
+    reach = 1 / (abs(d[0]) + abs(d[1]) + abs(d[2]))
+    return texels / 4 * (reach * reach * reach)
+
+
+def _add_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes):  # type: ignore[no-untyped-def]
+    radiance, d, pdf = sample_sky(t.sky, np.float64(u), np.float64(v))
+    if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], d[0], d[1], d[2], _INFINITE):
+        _add_light(1 / (_capture_density(d, texels) + rate * pdf), radiance, d, normals, lanes)
+    return True
+
+
+# One sample of the sky, where there is one.
+_add_sample_of_sky = either("sky")(_add_sky)(lambda t, ray, ray_bits, position, u, v, texels, rate, normals, lanes: False)
+
+
+@kernel
+def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance):  # type: ignore[no-untyped-def]
+    """Irradiance straight from emitters and sky, one sample of each a round; its weight is what the balance heuristic leaves to it.
 
     Parameters
     ----------
@@ -60,23 +93,14 @@ def _sample_emitters(t, ray, ray_bits, position, texel, texels, rounds, rate, ke
         # One sequence over the whole probe: rounds follow one another in it, so a pass is one run of points.
         reversed_index = reverse_bits(uint32((sample // SCRAMBLES * texels + texel) // _TEXELS_PER_LIGHT_SAMPLE))
         u, v = sobol_pair(reversed_index, key)
-        choice, _ = sobol_pair(reversed_index, key + uint64(1))
-        e, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], u, v, choice)
-        x, y, z = end[0] - position[0], end[1] - position[1], end[2] - position[2]
-        if pdf <= 0 or blocked(t, ray, ray_bits, position[0], position[1], position[2], x, y, z, np.float32(1)):
-            continue
-        # The density of capture rays in this direction; the 1-norm takes a unit vector onto the octahedron.
-        reach = 1 / (abs(d[0]) + abs(d[1]) + abs(d[2]))
-        gain = 1 / (texels / 4 * (reach * reach * reach) + rate * pdf)
-        fr = np.float32(gain * t.emitters.radiance[e, 0])
-        fg = np.float32(gain * t.emitters.radiance[e, 1])
-        fb = np.float32(gain * t.emitters.radiance[e, 2])
-        fx, fy, fz = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
-        for i in range(m):
-            f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
-            lanes[0, i] += f * fr
-            lanes[1, i] += f * fg
-            lanes[2, i] += f * fb
+        if t.emitters.cdf.shape[0]:
+            choice, _ = sobol_pair(reversed_index, key + uint64(1))
+            le, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], u, v, choice)
+            x, y, z = end[0] - position[0], end[1] - position[1], end[2] - position[2]
+            if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], x, y, z, np.float32(1)):
+                _add_light(1 / (_capture_density(d, texels) + rate * pdf), le, d, normals, lanes)
+        # Emitters and sky may share their numbers: each sum stays unbiased.
+        _add_sample_of_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes)
     for i in range(m):
         irradiance[i, 0] += lanes[0, i]
         irradiance[i, 1] += lanes[1, i]
@@ -124,7 +148,8 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
     m = normals.shape[1]
     texels = resolution * resolution
     # Light samples a round: a round is one sample through every texel.
-    light_rate = float((texels + _TEXELS_PER_LIGHT_SAMPLE - 1) // _TEXELS_PER_LIGHT_SAMPLE) if t.emitters.cdf.shape[0] else 0.0
+    lit = has_sky(t) or t.emitters.cdf.shape[0] > 0
+    light_rate = float((texels + _TEXELS_PER_LIGHT_SAMPLE - 1) // _TEXELS_PER_LIGHT_SAMPLE) if lit else 0.0
     for p in range(positions.shape[0]):
         x0, y0, z0 = positions[p, 0], positions[p, 1], positions[p, 2]
         probe_key = mix64(seed ^ mix64(ids[p]))
@@ -153,8 +178,9 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     b += -fold if b >= 0 else fold
                     length = math.sqrt(a * a + b * b + c * c)
                     dx, dy, dz = a / length, b / length, c / length
-                    emitted, direct, indirect, _, emitter_pdf = trace_path(
-                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False
+                    density = texels / 4 * (length * length * length)
+                    emitted, direct, indirect, _, light_pdf = trace_path(
+                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False, math.sqrt(1 / density)
                     )
                     red, green, blue = (
                         emitted[0] + direct[0] + indirect[0],
@@ -165,10 +191,9 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                     total_g += green
                     total_b += blue
                     count += 1
-                    density = texels / 4 * (length * length * length)
                     solid_angle = np.float32(1 / density)
                     # What light samples find too, they find better: the balance heuristic leaves this sample its share.
-                    share = density / (density + light_rate * emitter_pdf)
+                    share = density / (density + light_rate * light_pdf)
                     red, green, blue = red - (1 - share) * emitted[0], green - (1 - share) * emitted[1], blue - (1 - share) * emitted[2]
                     sum_r += red
                     sum_g += green
@@ -191,22 +216,9 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
                         irradiance[p, block, scramble, i, 2] += lanes[2, i] + mean_b * missed
                 if light_rate and texel % _TEXELS_PER_LIGHT_SAMPLE == 0:
                     light_key = mix64(probe_key + uint64(texels * SCRAMBLES + scramble))
-                    position = (x0, y0, z0)
                     rounds = (first + (scramble - first) % SCRAMBLES, end)
-                    _sample_emitters(
-                        t,
-                        ray,
-                        ray_bits,
-                        position,
-                        texel,
-                        texels,
-                        rounds,
-                        light_rate,
-                        light_key,
-                        normals,
-                        lanes,
-                        irradiance[p, block, scramble],
-                    )
+                    into = irradiance[p, block, scramble]
+                    _sample_lights(t, ray, ray_bits, (x0, y0, z0), texel, texels, rounds, light_rate, light_key, normals, lanes, into)
             if radiance.shape[0]:
                 radiance[p, texel, 0] += total_r
                 radiance[p, texel, 1] += total_g
@@ -223,18 +235,24 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
             return _CANCELLED
         for i in range(directions.shape[0]):
             dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-            set_ray(ray, ray_bits, positions[p, 0], positions[p, 1], positions[p, 2], dx, dy, dz, np.float32(np.inf))
-            intersect1(t.handle, ray.ctypes.data, 0)
-            if ray_bits[18] != _NOTHING:
-                point, n, _, _, material, front = surface(t, ray_bits, ray, dx, dy, dz)
-                x, y, z = point[0] - positions[p, 0], point[1] - positions[p, 1], point[2] - positions[p, 2]
-                distance[p, i] = math.sqrt(x * x + y * y + z * z)
-                normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
-                back[p, i] = not front and not t.materials.double_sided[material]
-            else:
-                distance[p, i] = np.inf
-                normal[p, i, 0] = normal[p, i, 1] = normal[p, i, 2] = 0
-                back[p, i] = False
+            distance[p, i] = np.inf
+            normal[p, i, 0] = normal[p, i, 1] = normal[p, i, 2] = 0
+            back[p, i] = False
+            x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
+            for _ in range(MAX_PASSED):
+                set_ray(ray, ray_bits, x, y, z, dx, dy, dz, _INFINITE)
+                intersect1(t.handle, ray.ctypes.data, 0)
+                if ray_bits[18] == _NOTHING:
+                    break
+                point, n, epsilon, _, material, front, triangle, b1, b2, _ = surface(t, ray_bits, ray, dx, dy, dz)
+                if not lets_through(t, material, triangle, b1, b2, ray_bits):
+                    x, y, z = point[0] - positions[p, 0], point[1] - positions[p, 1], point[2] - positions[p, 2]
+                    distance[p, i] = math.sqrt(x * x + y * y + z * z)
+                    normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
+                    back[p, i] = not front and not t.materials.double_sided[material]
+                    break
+                # Go on from the far side: the normal looks back at us.
+                x, y, z = point[0] - epsilon * n[0], point[1] - epsilon * n[1], point[2] - epsilon * n[2]
     return _DONE
 
 

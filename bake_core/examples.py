@@ -83,13 +83,13 @@ def _turned(size: Vec3, turn: tuple[float, float], position: Vec3) -> NDArray[np
     return matrix
 
 
-def closed_box(albedo: float, emission: float, max_bounces: int | None = None) -> Example:
+def closed_box(albedo: float, emission: float, max_bounces: int | None = None, *, metallic: float = 0.0, roughness: float = 1.0) -> Example:
     """A furnace: a sealed box of 2 × 2 × 2 m, all of whose walls have this albedo and emit this radiance, with 2 × 2 × 2 probes.
 
     Every texel of every probe has irradiance π·Le/(1−a); with `max_bounces` k, times (1−a^(k+1)).
     """
     w = GlbWriter()
-    wall = w.material("wall", (albedo,) * 3, emission=(emission,) * 3)
+    wall = w.material("wall", (albedo,) * 3, metallic=metallic, roughness=roughness, emission=(emission,) * 3)
     w.node("box", mesh=w.mesh("box", [_part(_box((-1, -1, -1), (1, 1, 1)), wall)]))
     # Off the box's symmetries, so that no two probes see the same.
     grid = {"name": "box", "origin": [-0.55, -0.45, -0.6], "spacing": [1.0, 1.0, 1.0], "counts": [2, 2, 2]}

@@ -1,8 +1,11 @@
-"""The one module that touches OpenImageIO: EXR files out and in, PNG out."""
+"""The one module that touches OpenImageIO: EXR files out and in, PNG out, PNG and JPEG and Radiance HDR in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,13 @@ from numpy.typing import NDArray
 from bake_core.errors import BakeError, InputError
 
 F32 = NDArray[np.float32]
+
+# What a picture's first bytes say it is, and the suffix by which OpenImageIO knows the format.
+_PICTURES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
+
+_RADIANCES = {b"\x76\x2f\x31\x01": ".exr", b"#?": ".hdr"}
+# An 8192 × 4096 sky: 400 MB as float32 RGB.
+_MAX_RADIANCE_TEXELS = 1 << 25
 
 # EXR files carry a date; a fixed one keeps them the same bytes for the same texels.
 _DATE = "2000:01:01 00:00:00"
@@ -81,3 +91,117 @@ def read_exr(path: Path, error: type[InputError], slug: str) -> tuple[F32, bool]
     if pixels is None:
         raise error(slug, complaint or "cannot be read", path.name)
     return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels), half
+
+
+def read_radiance(path: Path, error: type[InputError], slug: str, where: str) -> F32:
+    """Read an EXR or Radiance HDR, whatever its name, as linear RGB.
+
+    Returns
+    -------
+    pixels : (height, width, 3) float32
+        As stored, NaN and infinity too; a single luminance channel is spread over RGB, alpha and depth are left out.
+
+    Raises
+    ------
+    InputError
+        `error` with `slug` where it is neither, is broken, too large, or has no colour.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+    suffix = next((s for magic, s in _RADIANCES.items() if start.startswith(magic)), None)
+    if suffix is None:
+        raise error(slug, "is neither an EXR nor a Radiance HDR", where)
+    # OpenImageIO goes by the name, and a blob has none.
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / f"image{suffix}"
+        link.symlink_to(path.absolute())
+        source = oiio.ImageInput.open(str(link))
+        if source is None:
+            raise error(slug, _one_line(oiio.geterror() or "cannot be read"), where)
+        try:
+            spec = source.spec()
+            names = list(spec.channelnames)
+            if spec.width * spec.height * spec.depth > _MAX_RADIANCE_TEXELS:
+                raise error(slug, f"has {spec.width} × {spec.height} texels, more than 8192 × 4096", where)
+            if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
+                raise error(slug, "is a part cut out of a larger image; store the whole", where)
+            if not ({"R", "G", "B"} <= set(names) or names[0] == "Y"):
+                raise error(slug, f"has the channels {', '.join(names)}; give R, G and B, or Y", where)
+            pixels = source.read_image("float")
+            complaint = source.geterror()
+        finally:
+            source.close()
+    if pixels is None or complaint:
+        raise error(slug, _one_line(complaint or "cannot be read"), where)
+    chosen = [names.index(c) for c in "RGB"] if "R" in names else [0, 0, 0]
+    shaped = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    return np.ascontiguousarray(shaped[..., chosen])
+
+
+def picture_size(data: bytes, error: type[InputError], slug: str, where: str) -> tuple[int, int]:
+    """Width and height of a PNG or JPEG by its header; nothing is decoded.
+
+    Raises
+    ------
+    InputError
+        `error` with `slug` where it is neither, or its header is broken.
+    """
+    with _opened(data, error, slug, where) as source:
+        spec = source.spec()
+        return spec.width, spec.height
+
+
+def decode_picture(data: bytes, error: type[InputError], slug: str, where: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Decode a PNG or JPEG as it is stored: no colour conversion, no premultiplication, no rotation.
+
+    Returns
+    -------
+    pixels : (height, width, 4) uint8 or uint16
+        RGBA; grey is spread over RGB, and alpha is full where there is none.
+
+    Raises
+    ------
+    InputError
+        `error` with `slug` where it cannot be decoded whole.
+    """
+    with _opened(data, error, slug, where) as source:
+        spec = source.spec()
+        dtype = np.uint16 if spec.format == oiio.UINT16 else np.uint8
+        pixels = source.read_image("uint16" if dtype == np.uint16 else "uint8")
+        complaint = source.geterror()
+        if pixels is None or complaint:
+            raise error(slug, _one_line(complaint or "cannot be decoded"), where)
+    channels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    full = np.full((spec.height, spec.width, 4), np.iinfo(dtype).max, dtype)
+    if spec.nchannels < 3:
+        full[..., :3] = channels[..., :1]
+    else:
+        full[..., :3] = channels[..., :3]
+    if spec.nchannels in (2, 4):
+        full[..., 3] = channels[..., -1]
+    return full
+
+
+@contextmanager
+def _opened(data: bytes, error: type[InputError], slug: str, where: str) -> Iterator[oiio.ImageInput]:
+    suffix = next((s for magic, s in _PICTURES.items() if data.startswith(magic)), None)
+    if suffix is None:
+        raise error(slug, "is neither a PNG nor a JPEG, the formats of glTF", where)
+    # OpenImageIO's Python module reads files only.
+    with tempfile.NamedTemporaryFile(suffix=suffix) as file:
+        file.write(data)
+        file.flush()
+        config = oiio.ImageSpec()
+        config.attribute("oiio:UnassociatedAlpha", 1)
+        source = oiio.ImageInput.open(file.name, config)
+        if source is None:
+            raise error(slug, _one_line(oiio.geterror() or "cannot be read"), where)
+        try:
+            yield source
+        finally:
+            source.close()
+
+
+def _one_line(complaint: str) -> str:
+    """A complaint of OpenImageIO's without its line breaks and its names of temporary files."""
+    return "cannot be decoded: " + re.sub(r' \("[^"]*"\)', "", complaint).strip().replace("\n", "; ")

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.errors import SpecError
 from bake_core.kernels import kernel
 from bake_core.scene import LIGHT_DIRECTIONAL, LIGHT_POINT, LIGHT_SPOT, Lights, Scene
-from bake_core.spec import ConstantEnvironment, DirectionalLight, PointLight, Spec
+from bake_core.spec import DirectionalLight, PointLight, Spec
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -36,17 +35,20 @@ class LightTable(NamedTuple):
 class EmitterTable(NamedTuple):
     """Emissive triangles in the local frame.
 
-    vertices (e, 3, 3) float64; normal (e, 3) float64 unit, towards the front; radiance (e, 3) float64; double_sided (e,) bool;
-    cdf (e,) float64: running sum of the chance to be chosen; total float64: Σ area × weight × sides, where weight is the radiance's channel
-    sum, so that pdf_area = weight × sides / total.
+    vertices (e, 3, 3) float64; normal (e, 3) float64 unit, towards the front; material (e,) uint32; triangle (e,) int64, among all of the
+    scene's; double_sided (e,) bool; cdf (e,) float64: running sum of the chance to be chosen; total float64: Σ area × weight × sides, where
+    weight is the channel sum of the triangle's mean radiance, so that pdf_area = weight × sides / total; strength (t,) float64: that
+    weight by triangle of the scene, empty where it is the material's emission.
     """
 
     vertices: F64
     normal: F64
-    radiance: F64
+    material: NDArray[np.uint32]
+    triangle: NDArray[np.int64]
     double_sided: NDArray[np.bool_]
     cdf: F64
     total: float
+    strength: F64
 
 
 def merge_lights(scene: Scene, spec: Spec) -> Lights:
@@ -93,6 +95,17 @@ def merge_lights(scene: Scene, spec: Spec) -> Lights:
     )
 
 
+def cone_ramps(lights: Lights) -> F64:
+    """Scale and offset of each light's cone, (n, 2): by KHR_lights_punctual it is dimmed by saturate(cosθ · scale + offset)².
+
+    The extension's sample code keeps cos inner - cos outer above 0.001, which would darken every spot narrower than 2.5° to nothing much;
+    here only cosines that float32 cannot tell apart are held off each other, and make a hard edge.
+    """
+    inner, outer = lights.cos_inner.astype(np.float64), lights.cos_outer.astype(np.float64)
+    scale = 1 / np.maximum(2.0**-22, inner - outer)
+    return np.stack([scale, -outer * scale], 1)
+
+
 def light_table(lights: Lights, bounds: F64) -> LightTable:
     """The kernels' view of punctual lights.
 
@@ -108,9 +121,6 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
     weight = np.where(lights.kind == LIGHT_DIRECTIONAL, strength, strength / typical)
     shining = weight > 0
     weight = weight[shining]
-    inner, outer = lights.cos_inner[shining].astype(np.float64), lights.cos_outer[shining].astype(np.float64)
-    # KHR_lights_punctual: attenuation = saturate(cosθ · scale + offset)², scale = 1 / max(0.001, cos inner - cos outer).
-    scale = 1 / np.maximum(0.001, inner - outer)
     cdf = np.cumsum(weight / weight.sum()) if weight.size else np.zeros(0)
     if cdf.size:
         cdf[-1] = 1
@@ -119,21 +129,27 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
         lights.position[shining].astype(np.float64),
         lights.direction[shining].astype(np.float64),
         lights.value[shining].astype(np.float64),
-        np.stack([scale, -outer * scale], 1),
+        cone_ramps(lights)[shining],
         lights.range[shining].astype(np.float64),
         cdf,
     )
 
 
-def emitter_table(scene: Scene) -> EmitterTable:
-    """All emissive triangles of a scene, instances included; those without area are left out."""
-    corners, fronts, materials = [], [], []
+def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
+    """All emissive triangles of a scene, instances included; those without area are left out.
+
+    Parameters
+    ----------
+    strength : (t,) float64, optional
+        Channel sum of each triangle's mean radiance, where it is not simply its material's emission.
+    """
+    corners, fronts, materials, numbers = [], [], [], []
     first = scene.mesh_first_triangle
     items = [(0, np.eye(3, 4))] + list(zip(scene.instance_mesh.tolist(), scene.instance_transform, strict=True))
-    emissive = scene.materials.emission.max(axis=1, initial=0) > 0
+    weight = scene.materials.emission.astype(np.float64).sum(axis=1)[scene.triangle_material] if strength is None else strength
     for mesh in range(len(first) - 1):
         triangles = np.arange(first[mesh], first[mesh + 1])
-        triangles = triangles[emissive[scene.triangle_material[triangles]]]
+        triangles = triangles[weight[triangles] > 0]
         if not triangles.size:
             continue
         v = scene.positions[scene.indices[triangles]].astype(np.float64)
@@ -144,33 +160,23 @@ def emitter_table(scene: Scene) -> EmitterTable:
                 world = corners[-1]
                 fronts.append(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]) * mirrored)
                 materials.append(scene.triangle_material[triangles])
+                numbers.append(triangles)
+    by_triangle = np.zeros(0) if strength is None else strength
     if not corners:
         none = np.zeros((0, 3))
-        return EmitterTable(np.zeros((0, 3, 3)), none, none, np.zeros(0, np.bool_), np.zeros(0), 0.0)
-    vertices, front, material = np.concatenate(corners), np.concatenate(fronts), np.concatenate(materials)
+        return EmitterTable(
+            np.zeros((0, 3, 3)), none, np.zeros(0, np.uint32), np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0), 0.0, by_triangle
+        )
+    vertices, front, material, number = (np.concatenate(a) for a in (corners, fronts, materials, numbers))
     twice_area = np.linalg.norm(front, axis=1)
     solid = twice_area > 0
-    vertices, front, material, twice_area = vertices[solid], front[solid], material[solid], twice_area[solid]
-    radiance = scene.materials.emission[material].astype(np.float64)
+    vertices, front, material, number, twice_area = (a[solid] for a in (vertices, front, material, number, twice_area))
     double_sided = scene.materials.double_sided[material]
-    power = radiance.sum(1) * twice_area / 2 * np.where(double_sided, 2, 1)
+    power = weight[number] * twice_area / 2 * np.where(double_sided, 2, 1)
     cdf = np.cumsum(power / power.sum()) if power.size else np.zeros(0)
     if cdf.size:
         cdf[-1] = 1
-    return EmitterTable(vertices, front / twice_area[:, None], radiance, double_sided, cdf, float(power.sum()))
-
-
-def environment_radiance(spec: Spec) -> F64:
-    """The constant environment's radiance, (3,) float64.
-
-    Raises
-    ------
-    SpecError
-        ``spec.unsupported`` for an equirectangular image.
-    """
-    if not isinstance(spec.environment, ConstantEnvironment):
-        raise SpecError("spec.unsupported", "equirectangular environments are not traced yet; give a constant one", "environment.kind")
-    return np.asarray(spec.environment.radiance, np.float64)
+    return EmitterTable(vertices, front / twice_area[:, None], material, number, double_sided, cdf, float(power.sum()), by_triangle)
 
 
 @kernel

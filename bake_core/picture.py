@@ -55,6 +55,8 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
     `axes` holds the directions of one pixel's step right, one pixel's step down, and of the picture's upper left corner.
     """
     ray_bits = ray.view(np.uint32)
+    # At distance 1 before the camera.
+    pixel = math.sqrt(axes[0, 0] * axes[0, 0] + axes[0, 1] * axes[0, 1] + axes[0, 2] * axes[0, 2])
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             if cancelled[0]:
@@ -69,8 +71,9 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
                 dy = axes[2, 1] + x * axes[0, 1] + y * axes[1, 1]
                 dz = axes[2, 2] + x * axes[0, 2] + y * axes[1, 2]
                 length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                dx, dy, dz, spread = dx / length, dy / length, dz / length, pixel / length
                 emitted, direct, indirect, hit, _ = trace_path(
-                    t, ray, ray_bits, eye[0], eye[1], eye[2], dx / length, dy / length, dz / length, reversed_index, index, key, True
+                    t, ray, ray_bits, eye[0], eye[1], eye[2], dx, dy, dz, reversed_index, index, key, True, spread
                 )
                 for c in range(3):
                     out[row, column, c] += emitted[c]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bake_core.bake import Prepared, compile_kernels, empty_state, prepare, trace_shard
+from bake_core.environment import Find, no_images
 from bake_core.scene import Scene
 from bake_core.spec import Spec
 
@@ -49,7 +50,7 @@ class Plan:
     atlas_bytes: int
 
 
-def plan(scene: Scene, spec: Spec, *, threads: int) -> Plan:
+def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> Plan:
     """Predict a bake by tracing a few of its probes.
 
     Raises
@@ -57,7 +58,7 @@ def plan(scene: Scene, spec: Spec, *, threads: int) -> Plan:
     SpecError, SceneError
         As the bake would.
     """
-    prepared = prepare(scene, spec)
+    prepared = prepare(scene, spec, find)
     n, s = prepared.probe_count, prepared.selection
     speed = _paths_per_second(prepared, threads)
     one = empty_state(replace(prepared, positions=prepared.positions[:1]))

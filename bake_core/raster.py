@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.bundle import VolumeData
+from bake_core.errors import SceneError
+from bake_core.lights import cone_ramps
 from bake_core.picture import Picture
 from bake_core.probe_textures import probe_module, probe_textures
-from bake_core.scene import Camera, Lights, Scene
+from bake_core.scene import ALPHA_BLEND, ALPHA_MASK, NO_TEXTURE, Camera, Lights, Scene
 from bake_core.shader_compiler import compile_glsl, shader_text
 from bake_core.shadow_views import NEAR, Batch, batches, corners, view_matrices
 from bake_core.vulkan import Bindings, Buffer, Commands, Device, Draw, Image, color_target, depth_target, graphics_pipeline, storage
@@ -37,6 +39,7 @@ class Rasterizer:
     ----------
     device : Device
     scene : Scene
+        One that :func:`check_drawable` lets pass.
     lights : Lights
         All that shine, the spec's included, in the scene's local frame.
     environment : (3,) float
@@ -175,6 +178,34 @@ class Rasterizer:
         self._device.run(record)
 
 
+def check_drawable(scene: Scene) -> None:
+    """Refuse a scene that the shaders would draw as something else: they know even, opaque Lambert surfaces, with emission.
+
+    Raises
+    ------
+    SceneError
+        ``verification.unsupported``, naming a material in use and what of it is not drawn.
+    """
+    m = scene.materials
+    unknown = {
+        "unlit": m.unlit,
+        "alphaMode MASK": m.alpha_mode == ALPHA_MASK,
+        "alphaMode BLEND": m.alpha_mode == ALPHA_BLEND,
+        "baseColorTexture": m.base_color_texture != NO_TEXTURE,
+        "metallicRoughnessTexture": m.metallic_roughness_texture != NO_TEXTURE,
+        "emissiveTexture": m.emissive_texture != NO_TEXTURE,
+        "metallicFactor other than 0 or roughnessFactor other than 1": ~m.lambert,
+    }
+    for i in np.unique(scene.triangle_material):
+        features = [feature for feature, has in unknown.items() if has[i]]
+        if features:
+            raise SceneError(
+                "verification.unsupported",
+                f"has {', '.join(features)}, which verification does not draw yet; the bundle itself is not affected",
+                f"material {m.name[i]!r}",
+            )
+
+
 def picture_fragment_shader(volumes: Sequence[VolumeData], frame: ArrayLike) -> str:
     """The verification's fragment shader for a bundle: scene, probes, the reference module, and what uses them."""
     parts = (
@@ -282,8 +313,7 @@ def _light_rows(lights: Lights, groups: Sequence[Batch]) -> F32:
     rows[:, 0, :3], rows[:, 0, 3] = lights.position, lights.kind
     rows[:, 1, :3], rows[:, 1, 3] = lights.direction, lights.range
     rows[:, 2, :3] = lights.value
-    scale = 1 / np.maximum(0.001, lights.cos_inner.astype(np.float64) - lights.cos_outer)
-    rows[:, 3, 0], rows[:, 3, 1] = scale, -lights.cos_outer * scale
+    rows[:, 3, :2] = cone_ramps(lights)
     for batch in groups:
         rows[batch.first : batch.last, 2, 3] = batch.first_view
         rows[batch.first : batch.last, 3, 2] = batch.view_count

@@ -19,6 +19,54 @@ U32 = NDArray[np.uint32]
 Bool = NDArray[np.bool_]
 
 LIGHT_DIRECTIONAL, LIGHT_POINT, LIGHT_SPOT = 0, 1, 2
+ALPHA_OPAQUE, ALPHA_MASK, ALPHA_BLEND = 0, 1, 2
+WRAP_REPEAT, WRAP_MIRRORED, WRAP_CLAMP = 0, 1, 2
+NO_TEXTURE = -1
+
+
+@dataclass(frozen=True)
+class Image:
+    """One decoded picture, as its file holds it.
+
+    Attributes
+    ----------
+    name : str
+        How messages call it.
+    pixels : (height, width, 4) uint8 or uint16
+        RGBA, not premultiplied; row 0 is the top, where v = 0. No alpha in the file: all ones. Whether RGB is sRGB or linear is a matter
+        of use.
+    """
+
+    name: str
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """One use of an image by materials.
+
+    Attributes
+    ----------
+    image : int
+        Into `Scene.images`.
+    srgb : bool
+        RGB is decoded by the sRGB transfer function (IEC 61966-2-1); alpha never is.
+    wrap : (int, int)
+        WRAP_REPEAT, WRAP_MIRRORED or WRAP_CLAMP along u and v.
+    nearest : bool
+        No interpolation between texels.
+    uv_set : int
+        Which pair of columns of `Scene.uvs`.
+    transform : ((float, float, float), (float, float, float))
+        KHR_texture_transform: rows of the matrix that takes (u, v, 1) to the image's (u, v).
+    """
+
+    image: int
+    srgb: bool
+    wrap: tuple[int, int]
+    nearest: bool
+    uv_set: int
+    transform: tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -36,6 +84,15 @@ class Materials:
         Radiance (emissiveFactor × emissiveStrength), from the front, and from the back too where double-sided.
     double_sided : (m,) bool
         False: black from behind, and such hits count as backface hits.
+    unlit : (m,) bool
+        KHR_materials_unlit: the reader has moved the base colour into the emission and set (0, 0, 1) for base colour, metallic, roughness;
+        here the vertex colour multiplies the emission too.
+    alpha_mode : (m,) uint8
+        ALPHA_OPAQUE: alpha does not matter. ALPHA_MASK: a hole where alpha < cutoff. ALPHA_BLEND: there with probability alpha.
+    alpha, alpha_cutoff : (m,) float32
+        Factors; alpha is this × COLOR_0's × the base colour texture's.
+    base_color_texture, metallic_roughness_texture, emissive_texture : (m,) int32
+        Into `Scene.textures`, or NO_TEXTURE. Factors multiply what they hold: RGB, (·, roughness, metallic), RGB.
     """
 
     name: tuple[str, ...]
@@ -44,6 +101,19 @@ class Materials:
     roughness: F32
     emission: F32
     double_sided: Bool
+    unlit: Bool
+    alpha_mode: NDArray[np.uint8]
+    alpha: F32
+    alpha_cutoff: F32
+    base_color_texture: I32
+    metallic_roughness_texture: I32
+    emissive_texture: I32
+
+    @property
+    def lambert(self) -> Bool:
+        """(m,) bool: exactly Lambert at every point."""
+        flat: Bool = (self.metallic == 0) & (self.roughness == 1) & (self.metallic_roughness_texture == NO_TEXTURE)
+        return flat
 
 
 @dataclass(frozen=True)
@@ -109,6 +179,8 @@ class Scene:
         Vertices of all meshes, concatenated. A zero normal means: none given, shade flat. `normals` is (0, 3) where no mesh has any.
     colors : (v, 4) float32
         COLOR_0, linear; (0, 4) where no mesh has any.
+    uvs : (v, 2 s) float32
+        Texture coordinates: a pair of columns for each set that a texture in use names (`Texture.uv_set`); s may be 0.
     indices : (t, 3) uint32
         Triangles of all meshes, concatenated, into the vertex arrays above (not relative to the mesh).
         Counter-clockwise from the front, after mirrored transforms are accounted for.
@@ -122,6 +194,9 @@ class Scene:
     instance_transform : (i, 3, 4) float64
         Prototype space to local frame. A mirrored instance keeps its front: normals follow the inverse transpose.
     materials, lights, cameras, nodes
+    textures : tuple of Texture
+    images : tuple of Image
+        What materials in use look at, each once.
     ignored : tuple of str
         What was read over because it does not matter to a bake or is optional, one line each.
     """
@@ -132,6 +207,7 @@ class Scene:
     positions: F32
     normals: F32
     colors: F32
+    uvs: F32
     indices: U32
     triangle_material: U32
     mesh_first_triangle: I64
@@ -141,6 +217,8 @@ class Scene:
     lights: Lights
     cameras: tuple[Camera, ...]
     nodes: tuple[SceneNode, ...]
+    textures: tuple[Texture, ...]
+    images: tuple[Image, ...]
     ignored: tuple[str, ...]
 
     @property

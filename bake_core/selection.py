@@ -48,7 +48,7 @@ def select(scene: Scene, spec: Spec) -> Selection:
     """Choose outputs: what the spec demands, or what the scene's materials can make use of."""
     used = np.unique(scene.triangle_material)
     m = scene.materials
-    glossy = bool(((m.metallic[used] != 0) | (m.roughness[used] != 1)).any())
+    glossy = not bool(m.lambert[used].all())
     if spec.outputs == "auto":
         kept: tuple[OutputName, ...] = OUTPUTS if glossy else ("irradiance", "visibility")
         why = "no material is glossy, so nothing reflects single directions"

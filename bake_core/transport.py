@@ -19,21 +19,47 @@ from numpy.typing import NDArray
 
 from bake_core import embree
 from bake_core.embree import intersect1, occluded1, set_ray
-from bake_core.kernels import kernel
+from bake_core.environment import Environment, Sky, environment_radiance, has_sky, sample_sky
+from bake_core.ggx_albedo import AlbedoTable
+from bake_core.kernels import either, kernel
 from bake_core.lights import (
     EmitterTable,
     LightTable,
     choose,
     emitter_table,
-    environment_radiance,
     light_table,
     merge_lights,
     toward_light,
 )
-from bake_core.materials import INV_PI, MaterialTable, lambert_cosine, material_table, sample_lambert
+from bake_core.materials import (
+    INV_PI,
+    MaterialTable,
+    gloss,
+    gloss_table,
+    is_glossy,
+    lambert_cosine,
+    material_table,
+    no_gloss,
+    sample_gloss,
+    sample_lambert,
+    scattered,
+)
 from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair, uniform_triangle
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
+from bake_core.textures import (
+    TextureTable,
+    emission_at,
+    emission_left,
+    emits_unevenly,
+    has_holes,
+    lets_through,
+    mean_emission,
+    reflectance,
+    scattered_spread,
+    texture_table,
+    widened,
+)
 
 # Roulette by throughput begins where a path has lost 90 % of its weight. With the chance to go on equal to throughput / τ below τ, a
 # furnace of albedo a has a relative σ of τ√a from roulette: 10 % of a path here, against 100 % where τ = 1.
@@ -51,8 +77,10 @@ _EPSILON = 2.0**-20
 _INSET = 2.0**-17
 _INVALID = 0xFFFFFFFF
 _INFINITE = np.float32(np.inf)
-# Camera rays pass through back faces; this many before giving up bounds the loop on a pile of coincident ones.
-_MAX_PASSED = 256
+# Camera rays pass through back faces, all rays through what alpha cuts out; this many before giving up bounds the loop.
+MAX_PASSED = 4096
+# Where a shadow ray goes on behind a hole: distances along one ray are accurate to about an ulp of themselves.
+_PASSED = 1 + 2.0**-20
 
 
 class Tables(NamedTuple):
@@ -83,9 +111,12 @@ class Tables(NamedTuple):
     item_transform: NDArray[np.float64]
     item_normal: NDArray[np.float64]
     materials: MaterialTable
+    gloss: AlbedoTable | None
+    textures: TextureTable | None
     emitters: EmitterTable
     lights: LightTable
     environment: NDArray[np.float64]
+    sky: Sky | None
     max_bounces: np.int64
 
 
@@ -100,8 +131,13 @@ class Tracer:
     triangle_count: int
 
     @classmethod
-    def build(cls, scene: Scene, spec: Spec) -> Tracer:
+    def build(cls, scene: Scene, spec: Spec, environment: Environment) -> Tracer:
         """Build the acceleration structure and the kernels' tables.
+
+        Parameters
+        ----------
+        environment : Environment
+            What :func:`bake_core.environment.read_environment` makes of the spec's.
 
         Raises
         ------
@@ -124,11 +160,16 @@ class Tracer:
             item_transform=transforms,
             item_normal=_normal_matrices(transforms[:, :, :3]),
             materials=material_table(scene),
+            gloss=gloss_table(scene),
+            textures=texture_table(scene),
             emitters=emitter_table(scene),
             lights=light_table(lights, scene.bounds - scene.origin),
-            environment=environment_radiance(spec),
+            environment=environment.constant,
+            sky=environment.sky,
             max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
         )
+        if emits_unevenly(scene):
+            tables = tables._replace(emitters=emitter_table(scene, mean_emission(tables, scene)))
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
 
 
@@ -157,6 +198,11 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
         Vertex colour.
     material : int
     front : bool
+    triangle : int
+    b1, b2 : float64
+        Where in the triangle.
+    twice_area : float64
+        Of the triangle in the local frame, m².
     """
     item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
     triangle = t.item_first_triangle[item] + ray_bits[17]
@@ -198,6 +244,7 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
             k[2, 0] * gx + k[2, 1] * gy + k[2, 2] * gz,
         )
     length = math.sqrt(gx * gx + gy * gy + gz * gz)
+    twice_area = length
     if length > 0:
         gx, gy, gz = gx / length, gy / length, gz / length
     else:
@@ -233,15 +280,29 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
         green = b0 * c[0, 1] + b1 * c[1, 1] + b2 * c[2, 1]
         blue = b0 * c[0, 2] + b1 * c[1, 2] + b2 * c[2, 2]
     material = t.corner_bits[triangle, 9]
-    return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front
+    return (px, py, pz), (gx, gy, gz, nx, ny, nz), epsilon, (red, green, blue), material, front, triangle, b1, b2, twice_area
 
 
 @kernel
 def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
-    """Whether anything lies between a point and the light."""
+    """Whether anything lies between a point and the light: any hit, or hit after hit where something in the scene is cut out."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
-    occluded1(t.handle, ray.ctypes.data, 0)
-    return ray[8] < 0
+    if not has_holes(t):
+        occluded1(t.handle, ray.ctypes.data, 0)
+        return ray[8] < 0
+    for _ in range(MAX_PASSED):
+        intersect1(t.handle, ray.ctypes.data, 0)
+        if ray_bits[18] == _INVALID:
+            return False
+        item = ray_bits[19] if ray_bits[19] != _INVALID else ray_bits[18]
+        triangle = t.item_first_triangle[item] + ray_bits[17]
+        material = t.corner_bits[triangle, 9]
+        if not lets_through(t, material, triangle, np.float64(ray[15]), np.float64(ray[16]), ray_bits):
+            return True
+        beyond = np.float32(ray[8] * _PASSED)
+        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
+        ray[3] = beyond
+    return True
 
 
 @kernel
@@ -252,6 +313,15 @@ def pdf_emitter(t, strength, two_sided, d2, facing):  # type: ignore[no-untyped-
 
 
 @kernel
+def emitter_strength(t, material, triangle):  # type: ignore[no-untyped-def]
+    """What a triangle's part in the emitters' power is weighted by: its mean radiance, summed over channels."""
+    if t.emitters.strength.shape[0]:
+        return t.emitters.strength[triangle]
+    le = t.materials.emission[material]
+    return np.float64(le[0]) + np.float64(le[1]) + np.float64(le[2])
+
+
+@kernel
 def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
     """A point on the emissive triangles, chosen by power and area, as seen from a point.
 
@@ -259,12 +329,12 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    (int, 3 float64, float64, 3 float64)
-        The triangle, the unit direction to the point, its pdf per solid angle (0: it shines the other way), and the point lifted off its
-        surface
-        towards the viewer, so that the emitter does not block itself.
+    (3 float64, 3 float64, float64, 3 float64)
+        The radiance there, the unit direction to the point, its pdf per solid angle (0: no light comes from there), and the point lifted
+        off its surface towards the viewer, so that the emitter does not block itself.
     """
     e = t.emitters
+    radiance = (0.0, 0.0, 0.0)
     i, _ = choose(e.cdf, np.float64(w))
     b1, b2 = uniform_triangle(u, v)
     b0 = 1.0 - b1 - b2
@@ -281,44 +351,70 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
         facing = -(dx * e.normal[i, 0] + dy * e.normal[i, 1] + dz * e.normal[i, 2])
         side = 1.0 if facing > 0 else -1.0
         if facing > 0 or (facing < 0 and e.double_sided[i]):
-            strength = e.radiance[i, 0] + e.radiance[i, 1] + e.radiance[i, 2]
-            pdf = pdf_emitter(t, strength, e.double_sided[i], d2, facing * side)
+            material, triangle = e.material[i], e.triangle[i]
+            radiance = emission_left(t, material, triangle, np.float64(b1), np.float64(b2))
+            if radiance[0] + radiance[1] + radiance[2] > 0:
+                pdf = pdf_emitter(t, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
     lift = side * _EPSILON * (abs(x) + abs(y) + abs(z))
     lifted = (x + lift * e.normal[i, 0], y + lift * e.normal[i, 1], z + lift * e.normal[i, 2])
-    return i, (dx, dy, dz), pdf, lifted
+    return radiance, (dx, dy, dz), pdf, lifted
 
 
 @kernel
-def from_emitters(t, ray, ray_bits, p, n, epsilon, u, v, w):  # type: ignore[no-untyped-def]
-    """Light from one point of one emissive triangle: radiance times cosine over the sum of both techniques' pdfs.
+def from_emitters(t, ray, ray_bits, p, n, epsilon, glossy, look, u, v, w):  # type: ignore[no-untyped-def]
+    """Light from one point of one emissive triangle: radiance times :func:`scattered` over the sum of both techniques' pdfs.
 
-    The balance heuristic's weight p_l / (p_l + p_b) is already in it; p_b is :func:`bake_core.materials.sample_lambert`'s.
+    The balance heuristic's weight p_l / (p_l + p_b) is already in it.
     """
-    i, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
-    cosine = lambert_cosine(d[0], d[1], d[2], n)
-    if pdf <= 0 or cosine <= 0:
+    radiance, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
+    if pdf <= 0:
+        return 0.0, 0.0, 0.0
+    fr, fg, fb, bsdf_pdf = scattered(t, glossy, look, d[0], d[1], d[2], n)
+    if fr + fg + fb <= 0:
         return 0.0, 0.0, 0.0
     # Both ends have left their surfaces, so that neither of them blocks.
     ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     if blocked(t, ray, ray_bits, ox, oy, oz, end[0] - ox, end[1] - oy, end[2] - oz, np.float32(1.0)):
         return 0.0, 0.0, 0.0
-    gain = cosine * INV_PI / (pdf + cosine * INV_PI)
-    return gain * t.emitters.radiance[i, 0], gain * t.emitters.radiance[i, 1], gain * t.emitters.radiance[i, 2]
+    both = pdf + bsdf_pdf
+    return fr / both * radiance[0], fg / both * radiance[1], fb / both * radiance[2]
 
 
 @kernel
-def from_lights(t, ray, ray_bits, p, n, epsilon, u):  # type: ignore[no-untyped-def]
-    """Light from one punctual or directional light, chosen by weight: Σ f cosθ E over albedo, unbiased."""
+def _from_sky(t, ray, ray_bits, p, n, epsilon, glossy, look, u, v):  # type: ignore[no-untyped-def]
+    radiance, d, pdf = sample_sky(t.sky, np.float64(u), np.float64(v))
+    fr, fg, fb, bsdf_pdf = scattered(t, glossy, look, d[0], d[1], d[2], n)
+    if fr + fg + fb <= 0:
+        return 0.0, 0.0, 0.0
+    ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    if blocked(t, ray, ray_bits, ox, oy, oz, d[0], d[1], d[2], _INFINITE):
+        return 0.0, 0.0, 0.0
+    both = pdf + bsdf_pdf
+    return fr / both * radiance[0], fg / both * radiance[1], fb / both * radiance[2]
+
+
+# The same, from one direction of the sky.
+from_sky = either("sky")(_from_sky)(lambda t, ray, ray_bits, p, n, epsilon, glossy, look, u, v: (0.0, 0.0, 0.0))
+
+
+@kernel
+def from_lights(t, ray, ray_bits, p, n, epsilon, glossy, look, u):  # type: ignore[no-untyped-def]
+    """Light from one punctual or directional light, chosen by weight: Σ E times :func:`scattered`, unbiased."""
     i, chance = choose(t.lights.cdf, np.float64(u))
     wx, wy, wz, distance, gain = toward_light(t.lights, i, p[0], p[1], p[2])
-    cosine = lambert_cosine(wx, wy, wz, n)
-    if gain <= 0 or cosine <= 0:
+    if gain <= 0:
+        return 0.0, 0.0, 0.0
+    fr, fg, fb, _ = scattered(t, glossy, look, wx, wy, wz, n)
+    if fr + fg + fb <= 0:
         return 0.0, 0.0, 0.0
     ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
     if blocked(t, ray, ray_bits, ox, oy, oz, wx, wy, wz, np.float32(distance)):
         return 0.0, 0.0, 0.0
-    gain *= cosine * INV_PI / chance
-    return gain * t.lights.value[i, 0], gain * t.lights.value[i, 1], gain * t.lights.value[i, 2]
+    return (
+        gain * (fr / chance) * t.lights.value[i, 0],
+        gain * (fg / chance) * t.lights.value[i, 1],
+        gain * (fb / chance) * t.lights.value[i, 2],
+    )
 
 
 @kernel
@@ -330,7 +426,7 @@ def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-d
 
 
 @kernel
-def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera):  # type: ignore[no-untyped-def]
+def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread):  # type: ignore[no-untyped-def]
     """One path.
 
     Parameters
@@ -344,6 +440,8 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Sample point: its index within its scramble, with bits reversed and plain, and what picks the scramble.
     camera : bool
         Whether the ray itself passes through back faces of single-sided materials, as a rasteriser's does that culls them.
+    spread : float
+        Width of what the ray stands for, radians: the square root of its solid angle. Textures are averaged over it.
 
     Returns
     -------
@@ -355,8 +453,9 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Reflected at the first surface, all the rest.
     hit : bool
         Whether the ray met a surface.
-    emitter_pdf : float64
-        With which density :func:`sample_emitter` would have found what the ray met; 0 where it is no emissive triangle.
+    light_pdf : float64
+        With which density :func:`sample_emitter` or :func:`bake_core.environment.sample_sky` would have found what the ray met; 0 where
+        neither could.
     """
     emitted_r = emitted_g = emitted_b = 0.0
     direct_r = direct_g = direct_b = 0.0
@@ -367,59 +466,62 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     by_throughput = 1.0
     dark = 0
     pdf = 0.0
+    width = 0.0
     hit_any = False
-    emitter_pdf = 0.0
+    light_pdf = 0.0
     passed = 0
     depth = 0
     has_emitters = t.emitters.cdf.shape[0] > 0
     has_lights = t.lights.cdf.shape[0] > 0
-    sky = t.environment[0] + t.environment[1] + t.environment[2] > 0
+    shines = has_sky(t) or t.environment[0] + t.environment[1] + t.environment[2] > 0
+    look = no_gloss(t)
     needs_choice = t.emitters.cdf.shape[0] > 1 or t.lights.cdf.shape[0] > 1
+    # Where the ray goes on from, behind what it has passed through.
+    x, y, z = ox, oy, oz
     while True:
         if depth > 0 and depth >= t.max_bounces and not has_emitters:
             # The last ray can only find the environment: whether anything is in the way is a cheaper question than what.
-            if sky and not blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE):
-                indirect_r += beta_r / survival * t.environment[0]
-                indirect_g += beta_g / survival * t.environment[1]
-                indirect_b += beta_b / survival * t.environment[2]
-            break
-        set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE)
-        intersect1(t.handle, ray.ctypes.data, 0)
+            if not shines or blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, _INFINITE):
+                break
+            ray_bits[18] = _INVALID
+        else:
+            set_ray(ray, ray_bits, x, y, z, dx, dy, dz, _INFINITE)
+            intersect1(t.handle, ray.ctypes.data, 0)
         if ray_bits[18] == _INVALID:
             # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
+            radiance, sky_pdf = environment_radiance(t, dx, dy, dz)
             if depth == 0:
-                emitted_r, emitted_g, emitted_b = t.environment[0], t.environment[1], t.environment[2]
+                emitted_r, emitted_g, emitted_b = radiance
+                light_pdf = sky_pdf
             else:
-                indirect_r += beta_r / survival * t.environment[0]
-                indirect_g += beta_g / survival * t.environment[1]
-                indirect_b += beta_b / survival * t.environment[2]
+                # Rounding may put a direction where its own density is 0.
+                gain = pdf / (pdf + sky_pdf) if sky_pdf > 0 else 1.0
+                indirect_r += beta_r / survival * (gain * radiance[0])
+                indirect_g += beta_g / survival * (gain * radiance[1])
+                indirect_b += beta_b / survival * (gain * radiance[2])
             break
-        p, n, epsilon, color, material, front = surface(t, ray_bits, ray, dx, dy, dz)
+        s = surface(t, ray_bits, ray, dx, dy, dz)
+        p, n, epsilon, _, material, front, triangle, b1, b2, _ = s
         two_sided = t.materials.double_sided[material]
-        if not front and not two_sided:
-            if camera and depth == 0 and passed < _MAX_PASSED:
-                # Go on from the far side: the normal looks back at us.
-                ox, oy, oz = p[0] - epsilon * n[0], p[1] - epsilon * n[1], p[2] - epsilon * n[2]
-                passed += 1
-                continue
-            hit_any = hit_any or depth == 0
+        behind = not front and not two_sided
+        if passed < MAX_PASSED and ((behind and camera and depth == 0) or lets_through(t, material, triangle, b1, b2, ray_bits)):
+            # Go on from the far side: the normal looks back at us.
+            x, y, z = p[0] - epsilon * n[0], p[1] - epsilon * n[1], p[2] - epsilon * n[2]
+            passed += 1
+            continue
+        hit_any = hit_any or depth == 0
+        if behind:
             break
-        if depth == 0:
-            hit_any = True
         dark += 1
-        le_r, le_g, le_b = (
-            np.float64(t.materials.emission[material, 0]),
-            np.float64(t.materials.emission[material, 1]),
-            np.float64(t.materials.emission[material, 2]),
-        )
-        strength = le_r + le_g + le_b
-        if strength > 0:
+        le_r, le_g, le_b = emission_at(t, material, triangle, b1, b2, 0.0)
+        hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
+        facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
+        if le_r + le_g + le_b > 0:
             dark = 0
-            hx, hy, hz = p[0] - ox, p[1] - oy, p[2] - oz
-            facing = abs(dx * n[0] + dy * n[1] + dz * n[2])
+            strength = emitter_strength(t, material, triangle)
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
-                emitter_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
+                light_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
             else:
                 gain = pdf / (pdf + pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)) / survival
                 indirect_r += beta_r * gain * le_r
@@ -427,9 +529,15 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b * gain * le_b
         if depth >= t.max_bounces:
             break
-        beta_r *= np.float64(t.materials.albedo[material, 0]) * color[0]
-        beta_g *= np.float64(t.materials.albedo[material, 1]) * color[1]
-        beta_b *= np.float64(t.materials.albedo[material, 2]) * color[2]
+        width = widened(t, width, spread, math.sqrt(hx * hx + hy * hy + hz * hz))
+        base_r, base_g, base_b, metallic, roughness = reflectance(t, s, width, facing)
+        glossy = is_glossy(t, metallic, roughness)
+        if glossy:
+            look = gloss(t, (base_r, base_g, base_b), metallic, roughness, dx, dy, dz, n)
+        else:
+            beta_r *= base_r
+            beta_g *= base_g
+            beta_b *= base_b
         most = max(beta_r, beta_g, beta_b)
         if most <= 0:
             break
@@ -440,7 +548,15 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             choice, _ = sample_pair(reversed_index, index, depth, vertex + uint64(1))
         if has_emitters:
             light_u, light_v = sample_pair(reversed_index, index, depth, vertex + uint64(2))
-            r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, light_u, light_v, choice)
+            r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, glossy, look, light_u, light_v, choice)
+            if r + g + b > 0:
+                dark = 0
+                indirect_r += beta_r / survival * r
+                indirect_g += beta_g / survival * g
+                indirect_b += beta_b / survival * b
+        if has_sky(t):
+            light_u, light_v = sample_pair(reversed_index, index, depth, vertex + uint64(4))
+            r, g, b = from_sky(t, ray, ray_bits, p, n, epsilon, glossy, look, light_u, light_v)
             if r + g + b > 0:
                 dark = 0
                 indirect_r += beta_r / survival * r
@@ -448,7 +564,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 indirect_b += beta_b / survival * b
         if has_lights:
             # Emitters and punctual lights may share a number: each sum stays unbiased, and no product of the two is taken.
-            r, g, b = from_lights(t, ray, ray_bits, p, n, epsilon, choice)
+            r, g, b = from_lights(t, ray, ray_bits, p, n, epsilon, glossy, look, choice)
             if r + g + b > 0:
                 dark = 0
                 if depth == 1:
@@ -457,8 +573,19 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                     indirect_r += beta_r / survival * r
                     indirect_g += beta_g / survival * g
                     indirect_b += beta_b / survival * b
+        bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
+        if glossy:
+            dx, dy, dz = sample_gloss(t, look, np.float64(bsdf_u), np.float64(bsdf_v), n)
+            fr, fg, fb, pdf = scattered(t, glossy, look, dx, dy, dz, n)
+            if fr + fg + fb <= 0:
+                break
+            beta_r *= fr / pdf
+            beta_g *= fg / pdf
+            beta_b *= fb / pdf
+            most = max(beta_r, beta_g, beta_b)
         go_on = 1.0
-        if most < ROULETTE_THROUGHPUT:
+        # A gloss may weigh more than 1 in a direction that is seldom drawn: what roulette took away it does not give back.
+        if most < ROULETTE_THROUGHPUT * by_throughput:
             go_on = most / ROULETTE_THROUGHPUT / by_throughput
             by_throughput = most / ROULETTE_THROUGHPUT
         if dark > ROULETTE_DARK_VERTICES:
@@ -470,8 +597,11 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             if roulette >= go_on:
                 break
             survival *= go_on
-        bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
-        dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
-        pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+        if not glossy:
+            dx, dy, dz = sample_lambert(float(bsdf_u), float(bsdf_v), n)
+            pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+        spread = scattered_spread(t, spread, pdf)
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, emitter_pdf
+        x, y, z = ox, oy, oz
+        passed = 0
+    return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, light_pdf

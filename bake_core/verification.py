@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from bake_core.automatic_cameras import automatic_cameras
 from bake_core.bundle import Bundle, content_digest, dump_json
 from bake_core.comparison import Figures, compare
+from bake_core.environment import no_images, read_environment
 from bake_core.errors import BundleError, InputError
 from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
-from bake_core.raster import Rasterizer
+from bake_core.raster import Rasterizer, check_drawable
 from bake_core.scene import Camera, Scene
-from bake_core.spec import Spec, parse_spec
+from bake_core.spec import ConstantEnvironment, Spec, parse_spec
 from bake_core.thresholds import Thresholds
 from bake_core.transport import Tracer
 from bake_core.verification_report import PARTS, page, write_pictures
@@ -80,7 +81,9 @@ def verify(
     BundleError
         ``bundle.other_scene``, ``bundle.no_irradiance``.
     InputError
-        ``verification.invalid``, ``verification.in_the_way``.
+        ``verification.invalid``, ``verification.in_the_way``; ``verification.unsupported`` for an environment that is not drawn yet.
+    SceneError
+        ``verification.unsupported``, naming a material that is not drawn yet.
     MachineError
         ``vulkan.*`` where this machine cannot rasterise.
     Cancelled
@@ -89,9 +92,10 @@ def verify(
     thresholds = thresholds or Thresholds()
     _check_request(width, height, samples, out)
     spec = _check_bundle(bundle, scene)
+    check_drawable(scene)
     tell = _Teller(progress)
     tell("building", 0.0)
-    tracer = Tracer.build(scene, spec)
+    tracer = Tracer.build(scene, spec, read_environment(spec.environment, no_images)[0])
     work = out.with_name(f".{out.name}.{uuid.uuid4().hex}")
     work.mkdir()
     try:
@@ -149,7 +153,15 @@ def _check_bundle(bundle: Bundle, scene: Scene) -> Spec:
         raise BundleError("bundle.other_scene", f"was baked from {digest}, this scene is {scene.digest}; give that scene", str(bundle.path))
     if not all("irradiance" in v.atlases for v in bundle.volumes):
         raise BundleError("bundle.no_irradiance", "holds no irradiance to light a picture with; bake it with that output", str(bundle.path))
-    return parse_spec(bundle.manifest["spec"], f"{bundle.path}: spec")
+    spec = parse_spec(bundle.manifest["spec"], f"{bundle.path}: spec")
+    if not isinstance(spec.environment, ConstantEnvironment):
+        raise InputError(
+            "verification.unsupported",
+            f"the bundle was baked under an environment of kind {spec.environment.kind!r}, which verification does not draw yet; "
+            "the bundle itself is not affected",
+            f"{bundle.path}: spec: environment.kind",
+        )
+    return spec
 
 
 def _file_names(cameras: Sequence[Camera]) -> list[str]:

@@ -6,11 +6,14 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from bake_core.gltf.reader import load_scene_files
+from bake_core.environment import Find
+from bake_core.errors import BakeError, SpecError
 from bake_core.scene import Scene
-from service.blobs import Blobs
+from bake_core.scene_files import load_scene_files
+from service.blobs import DIGEST, Blobs
 
 # Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
 KEPT_OUTLINES = 64
@@ -21,8 +24,24 @@ def load_stored(blobs: Blobs, scene: Mapping[str, Any]) -> Scene:
     return load_scene_files(scene["root"], {name: blobs.local_path(digest) for name, digest in scene["files"].items()})
 
 
+def find_stored(blobs: Blobs) -> Find:
+    """Images that a spec names, from the blob store: by digest only, for paths are the sender's."""
+
+    def find(image: str) -> Path:
+        if not DIGEST.fullmatch(image):
+            raise SpecError(
+                "spec.image_not_found", f"{image!r} is not sha256:HEX; put the image as a blob and name it so", "environment.image"
+            )
+        try:
+            return blobs.local_path(image)
+        except (BakeError, FileNotFoundError):
+            raise SpecError("spec.image_not_found", f"there is no blob {image}; put it with PUT /v1/blobs", "environment.image") from None
+
+    return find
+
+
 class Outlines:
-    """The last scenes asked for, without their geometry."""
+    """The last scenes asked for, without their geometry and images."""
 
     def __init__(self, blobs: Blobs) -> None:
         self._blobs = blobs
@@ -40,8 +59,8 @@ class Outlines:
     def add(self, scene: Scene) -> Scene:
         """Keep and answer the outline of a scene that is at hand."""
         # Copies, for a slice would keep the whole array alive.
-        arrays = ("positions", "normals", "colors", "indices", "triangle_material")
-        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays})
+        arrays = ("positions", "normals", "colors", "uvs", "indices", "triangle_material")
+        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays}, images=())
         with self._lock:
             self._kept[scene.digest] = outline
             while len(self._kept) > KEPT_OUTLINES:

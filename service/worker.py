@@ -31,7 +31,7 @@ from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
 from service.blobs import Blobs
-from service.scenes import load_stored
+from service.scenes import find_stored, load_stored
 
 TOPIC = "octobake"
 # Oftener than this nobody can read; the terminal redraws at 10 Hz, a web page at less.
@@ -222,7 +222,7 @@ def _prepared(work: Work) -> bake.Prepared:
             # Room first: the old scene's memory is free before the new one's is taken.
             while len(_cache) >= work.cached_scenes:
                 _cache.popitem(last=False)
-            _cache[key] = bake.prepare(scene, parse_spec(work.spec))
+            _cache[key] = bake.prepare(scene, parse_spec(work.spec), find_stored(stored))
         _cache.move_to_end(key)
         return _cache[key]
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bake_core.environment import no_images, read_environment
 from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.scene import Camera, Scene
@@ -36,7 +37,8 @@ def load(writer: GlbWriter) -> Scene:
 def build(scene: Scene | GlbWriter, **spec: Any) -> Tracer:
     """A tracer, with some of the spec's keys given."""
     scene = load(scene) if isinstance(scene, GlbWriter) else scene
-    return Tracer.build(scene, parse_spec({"volumes": [ONE_PROBE], **spec}))
+    parsed = parse_spec({"volumes": [ONE_PROBE], **spec})
+    return Tracer.build(scene, parsed, read_environment(parsed.environment, no_images)[0])
 
 
 def sky(radiance: float = 1.0) -> dict[str, Any]:

@@ -55,6 +55,15 @@ ATTRIBUTES = {
     "JOINTS": Rule(("VEC4",), ((UBYTE, False), (USHORT, False))),
     "WEIGHTS": Rule(("VEC4",), _UNIT),
 }
+_SIGNED = ((BYTE, True), (SHORT, True))
+_INTEGERS = tuple((c, n) for c in (BYTE, UBYTE, SHORT, USHORT) for n in (False, True))
+# KHR_mesh_quantization allows these too.
+QUANTIZED = ATTRIBUTES | {
+    "POSITION": Rule(("VEC3",), ((FLOAT, False), *_INTEGERS)),
+    "NORMAL": Rule(("VEC3",), ((FLOAT, False), *_SIGNED)),
+    "TANGENT": Rule(("VEC4",), ((FLOAT, False), *_SIGNED)),
+    "TEXCOORD": Rule(("VEC2",), ((FLOAT, False), *_INTEGERS)),
+}
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,22 @@ class Accessors:
         self._views = [_view(v, document.buffers) for v in document.root.children("bufferViews")]
         self._all = [self._check(a) for a in document.root.children("accessors")]
         self._floats: dict[int, NDArray[np.float32]] = {}
+        used = (*document.root.texts("extensionsUsed"), *document.root.texts("extensionsRequired"))
+        self._attributes = QUANTIZED if "KHR_mesh_quantization" in used else ATTRIBUTES
 
     def __len__(self) -> int:
         return len(self._all)
+
+    @property
+    def views(self) -> int:
+        """How many bufferViews there are."""
+        return len(self._views)
+
+    def view_bytes(self, index: int) -> bytes:
+        """What a bufferView holds."""
+        view = self._views[index]
+        extensions.of(view.fields)
+        return bytes(view.data[view.offset :])
 
     def count(self, index: int) -> int:
         return self._all[index].count
@@ -114,10 +136,10 @@ class Accessors:
 
     def check_attribute(self, index: int, semantic: str, where: str) -> None:
         """Refuse an accessor whose type the attribute's semantic does not allow."""
-        self._require(index, ATTRIBUTES[semantic], where)
+        self._require(index, self._attributes[semantic], where)
 
     def floats(self, index: int) -> NDArray[np.float32]:
-        """(count, n) float32, integers normalised to [0, 1]; do not write to it.
+        """(count, n) float32, normalised integers in [0, 1] or [-1, 1]; do not write to it.
 
         Raises
         ------
@@ -131,8 +153,11 @@ class Accessors:
                 finite = np.isfinite(values).all(axis=1)
                 if not finite.all():
                     fail("not_finite", f"element {int(np.argmin(finite))} is NaN or infinite", accessor.where)
+            elif accessor.normalized:
+                # glTF 2.0, 3.11: the one value beyond -1 is -1 too.
+                values = np.maximum(np.divide(values, np.iinfo(values.dtype).max, dtype=np.float32), np.float32(-1))
             else:
-                values = np.divide(values, np.iinfo(values.dtype).max, dtype=np.float32)
+                values = values.astype(np.float32)
             self._floats[index] = values
         return self._floats[index]
 

@@ -30,16 +30,55 @@ class Document:
         The JSON document.
     buffers : tuple of bytes
         Cut to their declared byteLength.
-    digest : str
-        ``sha256:HEX``, see :func:`scene_digest`.
+    resources : Resources
+        The files of the scene, of which the buffers' are read already.
     notes : Notes
         What was read over so far.
     """
 
     root: Fields
     buffers: tuple[memoryview, ...]
-    digest: str
+    resources: Resources
     notes: Notes
+
+
+class Resources:
+    """The bytes behind URIs: ``data:`` or files, each read once; it knows which files the scene uses.
+
+    Parameters
+    ----------
+    root : str
+        Name of the .glb or .gltf.
+    data : bytes
+        What it holds.
+    opener : Opener
+    """
+
+    def __init__(self, root: str, data: bytes, opener: Opener) -> None:
+        self._root = root
+        self._opener = opener
+        self._digests = {root: _sha256(data)}
+        self._read: dict[str, bytes] = {}
+
+    def get(self, uri: str, place: str) -> bytes:
+        """What a URI stands for.
+
+        Raises
+        ------
+        SceneError
+            ``gltf.bad_data_uri``, ``gltf.unsafe_uri``, ``gltf.missing_file``.
+        """
+        if names.is_data(uri):
+            return names.decode_data(uri, place)
+        name = names.safe_name(uri, place)
+        if name not in self._read:
+            self._read[name] = names.read_file(self._opener(name, place), name, place)
+            self._digests[name] = _sha256(self._read[name])
+        return self._read[name]
+
+    def digest(self) -> str:
+        """``sha256:HEX`` of the scene by the files read so far, see :func:`scene_digest`."""
+        return scene_digest(self._root, self._digests)
 
 
 def open_path(path: Path) -> Document:
@@ -92,9 +131,8 @@ def _open(name: str, path: Path, opener: Opener) -> Document:
     for image in root.children("images"):
         if "uri" in image and not names.is_data(image.text("uri")):
             names.safe_name(image.text("uri"), image.place("uri"))
-    files = {name: _sha256(data)}
-    buffers = _buffers(root, binary, opener, files, notes)
-    return Document(root, buffers, scene_digest(name, files), notes)
+    resources = Resources(name, data, opener)
+    return Document(root, _buffers(root, binary, resources, notes), resources, notes)
 
 
 def _chunks(data: bytes, name: str, notes: Notes) -> tuple[bytes, memoryview | None]:
@@ -153,9 +191,8 @@ def _check_version(root: Fields) -> None:
         fail("bad_version", f"the file asks for a reader of glTF {needed}; this one reads 2.0", asset.place("minVersion"))
 
 
-def _buffers(root: Fields, binary: memoryview | None, opener: Opener, files: dict[str, str], notes: Notes) -> tuple[memoryview, ...]:
-    """Every buffer's bytes; `files` gains the digest of each file read."""
-    read: dict[str, bytes] = {}
+def _buffers(root: Fields, binary: memoryview | None, resources: Resources, notes: Notes) -> tuple[memoryview, ...]:
+    """Every buffer's bytes."""
     buffers = []
     fields = root.children("buffers")
     if binary is not None and (not fields or "uri" in fields[0]):
@@ -167,14 +204,8 @@ def _buffers(root: Fields, binary: memoryview | None, opener: Opener, files: dic
             if i > 0:
                 fail("missing_key", "is required: only the first buffer of a GLB may go without", place)
             data = binary if binary is not None else fail("missing_bin", "has no uri, and the file has no BIN chunk", buffer.where)
-        elif names.is_data(uri := buffer.text("uri")):
-            data = memoryview(names.decode_data(uri, place))
         else:
-            name = names.safe_name(uri, place)
-            if name not in read:
-                read[name] = names.read_file(opener(name, place), name, place)
-                files[name] = _sha256(read[name])
-            data = memoryview(read[name])
+            data = memoryview(resources.get(buffer.text("uri"), place))
         if len(data) < length:
             fail("buffer_too_short", f"is {length}, but there are only {len(data)} bytes", buffer.place("byteLength"))
         buffers.append(data[:length])

@@ -7,6 +7,9 @@ from bake_core.gltf.fields import Fields, Notes, fail, quoted
 READ = {
     "KHR_lights_punctual": "directional, point and spot lights",
     "KHR_materials_emissive_strength": "factor of a material's emission",
+    "KHR_materials_unlit": "emits its base colour and reflects nothing",
+    "KHR_mesh_quantization": "vertices of integers",
+    "KHR_texture_transform": "offset, rotation, scale and set of texture coordinates",
 }
 
 # Reading over one of these would change geometry or light, although files may list them as optional.
@@ -14,10 +17,7 @@ REFUSED = {
     "EXT_mesh_gpu_instancing": "give each instance a node of its own",
     "EXT_meshopt_compression": "decompress it first (gltf-transform copy)",
     "KHR_draco_mesh_compression": "decompress it first (gltf-transform copy)",
-    "KHR_materials_unlit": "use emissiveFactor",
-    "KHR_mesh_quantization": "dequantise it first (gltf-transform dequantize)",
     "KHR_meshopt_compression": "decompress it first (gltf-transform copy)",
-    "KHR_texture_transform": "textures are not read yet",
 }
 
 

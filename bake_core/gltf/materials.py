@@ -1,17 +1,24 @@
-"""Materials: metallic-roughness factors, emission and sides, for the materials that something visible uses."""
+"""Materials: metallic-roughness, emission, alpha and sides, for the materials that something visible uses."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bake_core.gltf import extensions
 from bake_core.gltf.fields import Fields, Notes, fail, quoted
-from bake_core.scene import Materials
+from bake_core.gltf.textures import Textures
+from bake_core.scene import ALPHA_BLEND, ALPHA_MASK, ALPHA_OPAQUE, NO_TEXTURE, Materials
 
 DEFAULT_NAME = "(default)"
+ALPHA_MODES = {"OPAQUE": ALPHA_OPAQUE, "MASK": ALPHA_MASK, "BLEND": ALPHA_BLEND}
+# Textures that are read over, and why that is right or what is missing then.
+IGNORED_TEXTURES = {
+    "normalTexture": "shading follows the vertices' normals",
+    "occlusionTexture": "a path tracer finds occlusion itself",
+}
 _MAX_RADIANCE = float(np.finfo(np.float32).max)
 
 
@@ -25,9 +32,16 @@ class Row:
     roughness: float = 1.0
     emission: tuple[float, ...] = (0.0, 0.0, 0.0)
     double_sided: bool = False
+    unlit: bool = False
+    alpha_mode: int = ALPHA_OPAQUE
+    alpha: float = 1.0
+    alpha_cutoff: float = 0.5
+    base_color_texture: int = NO_TEXTURE
+    metallic_roughness_texture: int = NO_TEXTURE
+    emissive_texture: int = NO_TEXTURE
 
 
-def read_materials(root: Fields, used: Collection[int | None], notes: Notes) -> tuple[Materials, dict[int | None, int]]:
+def read_materials(root: Fields, used: Collection[int | None], textures: Textures, notes: Notes) -> tuple[Materials, dict[int | None, int]]:
     """The materials in `used`, in the file's order; None stands for glTF's default material, and comes last.
 
     Returns
@@ -39,42 +53,31 @@ def read_materials(root: Fields, used: Collection[int | None], notes: Notes) -> 
     Raises
     ------
     SceneError
-        For wrong values in any material, and ``gltf.unsupported_texture``, ``gltf.unsupported_alpha_mode`` and
-        ``gltf.unsupported_extension`` in a used one.
+        For wrong values in any material, and ``gltf.unsupported_extension`` and what :meth:`Textures.use` raises for a used one.
     """
     rows: list[Row] = []
     row_of: dict[int | None, int] = {}
-    textures = root.count("textures")
     for i, fields in enumerate(root.children("materials")):
-        row, unsupported = _read(fields, textures, notes if i in used else Notes())
+        row = _read(fields, textures, notes if i in used else None)
         if i in used:
-            if unsupported is not None:
-                fail(*unsupported)
             extensions.of(fields)
             row_of[i] = len(rows)
             rows.append(row)
-        elif unsupported is not None:
-            notes.add("a material that nothing uses", fields.where)
     if None in used:
         row_of[None] = len(rows)
         rows.append(Row())
     return _columns(rows), row_of
 
 
-def _read(f: Fields, textures: int, notes: Notes) -> tuple[Row, tuple[str, str, str] | None]:
-    """A material's row, and the arguments of :func:`fail` if it has what is not read yet."""
-    unsupported: tuple[str, str, str] | None = None
+def _read(f: Fields, textures: Textures, notes: Notes | None) -> Row:
+    """A material's row; without `notes` it is only checked, and none of its textures is used."""
 
-    def texture(owner: Fields, key: str) -> None:
-        nonlocal unsupported
+    def texture(owner: Fields, key: str, *, srgb: bool) -> int:
         if key not in owner:
-            return
+            return NO_TEXTURE
         info = owner.child(key)
-        info.required_index("index", textures, "textures")
-        if key == "occlusionTexture":
-            notes.add("occlusionTexture (a path tracer finds occlusion itself)", info.where)
-        else:
-            unsupported = unsupported or ("unsupported_texture", "textures are not read yet; bake factors instead", info.where)
+        textures.check(info)
+        return textures.use(info, srgb=srgb) if notes is not None else NO_TEXTURE
 
     pbr = f.child("pbrMetallicRoughness")
     base = pbr.numbers("baseColorFactor", (1.0, 1.0, 1.0, 1.0), low=0, high=1)
@@ -85,19 +88,39 @@ def _read(f: Fields, textures: int, notes: Notes) -> tuple[Row, tuple[str, str, 
     strength = strength_fields.number("emissiveStrength", default=1.0, low=0)
     if strength > _MAX_RADIANCE:
         fail("overflow", f"{strength:g} is beyond float32", strength_fields.place("emissiveStrength"))
-    texture(pbr, "baseColorTexture")
-    texture(pbr, "metallicRoughnessTexture")
-    for key in ("normalTexture", "emissiveTexture", "occlusionTexture"):
-        texture(f, key)
     mode = f.text("alphaMode", "OPAQUE")
-    if mode not in ("OPAQUE", "MASK", "BLEND"):
-        fail("out_of_range", f"is {quoted(mode)}, must be OPAQUE, MASK or BLEND", f.place("alphaMode"))
-    f.number("alphaCutoff", default=0.5, low=0)
-    if mode != "OPAQUE":
-        unsupported = unsupported or ("unsupported_alpha_mode", f"{mode} is not read yet; use OPAQUE", f.place("alphaMode"))
-    emission = tuple(c * strength for c in factor)
-    name = f.text("name", "") or f.where
-    return Row(name, base[:3], metallic, roughness, emission, f.boolean("doubleSided")), unsupported
+    if mode not in ALPHA_MODES:
+        fail("out_of_range", f"is {quoted(mode)}, must be {', '.join(ALPHA_MODES)}", f.place("alphaMode"))
+    cutoff = f.number("alphaCutoff", default=0.5, low=0)
+    unlit = "KHR_materials_unlit" in f.child("extensions")
+    for key, why in IGNORED_TEXTURES.items():
+        if key in f:
+            textures.check(f.child(key))
+            if notes is not None:
+                notes.add(f"{key} ({why})", f.place(key))
+    row = Row(
+        name=f.text("name", "") or f.where,
+        double_sided=f.boolean("doubleSided"),
+        alpha_mode=ALPHA_MODES[mode],
+        alpha=base[3],
+        # Beyond float32 is beyond every alpha.
+        alpha_cutoff=min(cutoff, 2.0),
+        base_color_texture=texture(pbr, "baseColorTexture", srgb=True),
+    )
+    if unlit:
+        # KHR_materials_unlit: the colour, and nothing of what lighting would need.
+        return replace(
+            row, base_color=(0.0, 0.0, 0.0), metallic=0.0, unlit=True, emission=base[:3], emissive_texture=row.base_color_texture
+        )
+    return replace(
+        row,
+        base_color=base[:3],
+        metallic=metallic,
+        roughness=roughness,
+        emission=tuple(c * strength for c in factor),
+        metallic_roughness_texture=texture(pbr, "metallicRoughnessTexture", srgb=False),
+        emissive_texture=texture(f, "emissiveTexture", srgb=True) if strength * max(factor) > 0 else NO_TEXTURE,
+    )
 
 
 def _columns(rows: list[Row]) -> Materials:
@@ -111,4 +134,11 @@ def _columns(rows: list[Row]) -> Materials:
         roughness=column([r.roughness for r in rows]),
         emission=column([r.emission for r in rows], 3),
         double_sided=np.array([r.double_sided for r in rows], np.bool_),
+        unlit=np.array([r.unlit for r in rows], np.bool_),
+        alpha_mode=np.array([r.alpha_mode for r in rows], np.uint8),
+        alpha=column([r.alpha for r in rows]),
+        alpha_cutoff=column([r.alpha_cutoff for r in rows]),
+        base_color_texture=np.array([r.base_color_texture for r in rows], np.int32),
+        metallic_roughness_texture=np.array([r.metallic_roughness_texture for r in rows], np.int32),
+        emissive_texture=np.array([r.emissive_texture for r in rows], np.int32),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,7 @@ class Primitive:
     position: int
     normal: int | None
     color: int | None
+    texcoords: Mapping[int, int]
     material: int | None
     triangle_count: int
 
@@ -58,6 +59,8 @@ class Mesh:
         Unit, or zero where there is none; None where all are.
     colors : (v, 4) float32 or None
         Linear, in [0, 1].
+    uvs : (v, 2 s) float32 or None
+        Texture coordinates of the scene's s sets; None where it has none.
     triangles : (t, 3) uint32
     material : (t,) uint32
         Rows of the scene's materials.
@@ -66,6 +69,7 @@ class Mesh:
     positions: F32
     normals: F32 | None
     colors: F32 | None
+    uvs: F32 | None
     triangles: U32
     material: U32
 
@@ -102,6 +106,7 @@ def _check_primitive(p: Fields, accessors: Accessors, materials: int, notes: Not
     if "POSITION" not in attributes:
         fail("missing_key", "is required: without positions there is no geometry", attributes.place("POSITION"))
     found: dict[str, int] = {}
+    texcoords: dict[int, int] = {}
     vertices = 0
     for name in ["POSITION", *(k for k in attributes.value if k != "POSITION")]:
         accessor = attributes.required_index(name, len(accessors), "accessors")
@@ -113,7 +118,9 @@ def _check_primitive(p: Fields, accessors: Accessors, materials: int, notes: Not
         vertices = vertices or accessors.count(accessor)
         if accessors.count(accessor) != vertices:
             fail("count_mismatch", f"has {accessors.count(accessor)} elements, POSITION has {vertices}", place)
-        if name not in ("POSITION", "NORMAL", "COLOR_0"):
+        if semantic == "TEXCOORD":
+            texcoords[int(name.partition("_")[2])] = accessor
+        elif name not in ("POSITION", "NORMAL", "COLOR_0"):
             notes.add(f"vertex attribute {quoted(name)}", p.where)
     indices = p.index("indices", len(accessors), "accessors")
     if indices is not None:
@@ -128,7 +135,7 @@ def _check_primitive(p: Fields, accessors: Accessors, materials: int, notes: Not
         counted = p.where if indices is None else p.place("indices")
         fail("bad_count", f"{corners} vertices do not make {MODES[mode]}", counted)
     count = corners // 3 if mode == TRIANGLES else corners - 2
-    return Primitive(p.where, mode, indices, found["POSITION"], found.get("NORMAL"), found.get("COLOR_0"), material, count)
+    return Primitive(p.where, mode, indices, found["POSITION"], found.get("NORMAL"), found.get("COLOR_0"), texcoords, material, count)
 
 
 def check_size(triangles: int, where: str) -> None:
@@ -136,8 +143,15 @@ def check_size(triangles: int, where: str) -> None:
         fail("too_large", f"{triangles} triangles are more than {MAX_TRIANGLES} (2^28)", where)
 
 
-def read_mesh(outline: Outline, accessors: Accessors, row_of: Mapping[int | None, int]) -> Mesh:
+def read_mesh(outline: Outline, accessors: Accessors, row_of: Mapping[int | None, int], sets: Sequence[int]) -> Mesh:
     """Read a mesh's vertices, each that a triangle uses, once.
+
+    Parameters
+    ----------
+    row_of : mapping
+        Material index in the file, or None, to row in the scene.
+    sets : sequence of int
+        The TEXCOORDs that textures look at; zeros where a primitive has none, for then its material looks at none.
 
     Raises
     ------
@@ -145,19 +159,20 @@ def read_mesh(outline: Outline, accessors: Accessors, row_of: Mapping[int | None
         ``gltf.index_out_of_range`` for a vertex, ``gltf.primitive_restart``, ``gltf.not_finite``.
     """
     # Exporters let the primitives of one mesh share their vertices.
-    groups: dict[tuple[int, int | None, int | None], list[Primitive]] = {}
+    groups: dict[tuple[int | None, ...], list[Primitive]] = {}
     for p in outline.primitives:
-        groups.setdefault((p.position, p.normal, p.color), []).append(p)
-    parts = [_read_group(g, accessors, row_of) for g in groups.values()]
+        groups.setdefault((p.position, p.normal, p.color, *(p.texcoords.get(s) for s in sets)), []).append(p)
+    parts = [_read_group(g, accessors, row_of, sets) for g in groups.values()]
     if len(parts) == 1:
         return parts[0]
     if not parts:
-        return Mesh(np.zeros((0, 3), np.float32), None, None, np.zeros((0, 3), np.uint32), np.zeros(0, np.uint32))
+        return Mesh(np.zeros((0, 3), np.float32), None, None, None, np.zeros((0, 3), np.uint32), np.zeros(0, np.uint32))
     first = np.cumsum([0] + [len(p.positions) for p in parts])
     return Mesh(
         positions=np.concatenate([p.positions for p in parts]),
         normals=join([(p.normals, len(p.positions)) for p in parts], 3, 0.0),
         colors=join([(p.colors, len(p.positions)) for p in parts], 4, 1.0),
+        uvs=join([(p.uvs, len(p.positions)) for p in parts], 2 * len(sets), 0.0),
         triangles=np.concatenate([p.triangles + np.uint32(base) for p, base in zip(parts, first, strict=False)]),
         material=np.concatenate([p.material for p in parts]),
     )
@@ -170,7 +185,7 @@ def join(parts: list[tuple[F32 | None, int]], width: int, fill: float) -> F32 | 
     return np.concatenate([np.full((count, width), fill, np.float32) if values is None else values for values, count in parts])
 
 
-def _read_group(group: list[Primitive], accessors: Accessors, row_of: Mapping[int | None, int]) -> Mesh:
+def _read_group(group: list[Primitive], accessors: Accessors, row_of: Mapping[int | None, int], sets: Sequence[int]) -> Mesh:
     first = group[0]
     positions = accessors.floats(first.position)
     corners = np.concatenate([_triangles(p, accessors, len(positions)) for p in group])
@@ -179,9 +194,13 @@ def _read_group(group: list[Primitive], accessors: Accessors, row_of: Mapping[in
     positions = np.ascontiguousarray(positions[used])
     normals = _unit(accessors.floats(first.normal)[used]) if first.normal is not None else None
     colors = _rgba(accessors.floats(first.color)[used]) if first.color is not None else None
+    uvs = None
+    if any(s in first.texcoords for s in sets):
+        none = np.zeros((len(positions), 2), np.float32)
+        uvs = np.hstack([accessors.floats(first.texcoords[s])[used] if s in first.texcoords else none for s in sets])
     if normals is not None and _say_nothing(normals, positions, triangles):
         normals = None
-    return Mesh(positions, normals, colors, triangles, material)
+    return Mesh(positions, normals, colors, uvs, triangles, material)
 
 
 def _renumber(corners: NDArray[np.integer], vertices: int) -> tuple[NDArray[np.integer] | NDArray[np.bool_], U32]:

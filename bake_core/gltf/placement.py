@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class Placed:
     positions: F32
     normals: F32
     colors: F32
+    uvs: F32
     indices: U32
     triangle_material: U32
     mesh_first_triangle: I64
@@ -38,7 +39,7 @@ class Placed:
     instance_transform: F64
 
 
-def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], nodes: Nodes) -> Placed:
+def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], nodes: Nodes, sets: int) -> Placed:
     """Place meshes by their nodes, around the centre of what they cover.
 
     A mesh of several nodes becomes a prototype, but where a node flattens it (`MIN_FLATNESS`) it is baked.
@@ -49,6 +50,8 @@ def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], no
         By their index in the file; each has a triangle.
     uses : sequence of (node, mesh)
         In the order of nodes.
+    sets : int
+        How many sets of texture coordinates meshes have.
 
     Raises
     ------
@@ -98,12 +101,14 @@ def place_meshes(meshes: Mapping[int, Mesh], uses: Sequence[tuple[int, int]], no
     counts = [sum(len(m.triangles) for m in everything[: len(baked)])] + [len(m.triangles) for m in centred]
     normals = join([(m.normals, len(m.positions)) for m in everything], 3, 0.0)
     colors = join([(m.colors, len(m.positions)) for m in everything], 4, 1.0)
+    uvs = join([(m.uvs, len(m.positions)) for m in everything], 2 * sets, 0.0)
     return Placed(
         origin=origin,
         bounds=bounds,
         positions=np.concatenate([m.positions for m in everything] or [np.zeros((0, 3), np.float32)]),
         normals=normals if normals is not None else np.zeros((0, 3), np.float32),
         colors=colors if colors is not None else np.zeros((0, 4), np.float32),
+        uvs=uvs if uvs is not None else np.zeros((sum(len(m.positions) for m in everything), 2 * sets), np.float32),
         indices=np.concatenate(
             [m.triangles + np.uint32(v) for m, v in zip(everything, first_vertex, strict=False)] or [np.zeros((0, 3), np.uint32)]
         ),
@@ -130,7 +135,7 @@ def _bake(mesh: Mesh, matrix: F64, regular: bool) -> tuple[F64, Mesh]:
     with np.errstate(over="ignore", invalid="ignore"):
         world = mesh.positions.astype(np.float64) @ matrix[:, :3].T + matrix[:, 3]
     if not regular:
-        return world, Mesh(mesh.positions, None, mesh.colors, mesh.triangles, mesh.material)
+        return world, replace(mesh, normals=None)
     linear = matrix[:, :3] / np.abs(matrix[:, :3]).max()
     side = np.sign(np.linalg.det(linear))
     normals = mesh.normals
@@ -141,11 +146,11 @@ def _bake(mesh: Mesh, matrix: F64, regular: bool) -> tuple[F64, Mesh]:
         length = np.linalg.norm(turned, axis=1, keepdims=True)
         normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0).astype(np.float32)
     triangles = mesh.triangles if side > 0 else mesh.triangles[:, [0, 2, 1]]
-    return world, Mesh(mesh.positions, normals, mesh.colors, triangles, mesh.material)
+    return world, replace(mesh, normals=normals, triangles=triangles)
 
 
 def _moved(mesh: Mesh, positions: F64) -> Mesh:
-    return Mesh(positions.astype(np.float32), mesh.normals, mesh.colors, mesh.triangles, mesh.material)
+    return replace(mesh, positions=positions.astype(np.float32))
 
 
 def _box(points: F64) -> F64:

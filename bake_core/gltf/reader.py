@@ -17,13 +17,14 @@ from bake_core.gltf import container, extensions
 from bake_core.gltf.accessors import Accessors
 from bake_core.gltf.cameras import read_cameras
 from bake_core.gltf.container import Document
-from bake_core.gltf.fields import Fields, Notes, fail
+from bake_core.gltf.fields import Fields, Notes, fail, quoted
 from bake_core.gltf.lights import read_lights
 from bake_core.gltf.materials import read_materials
-from bake_core.gltf.meshes import Outline, check_mesh, check_size, read_mesh
+from bake_core.gltf.meshes import Outline, Primitive, check_mesh, check_size, read_mesh
 from bake_core.gltf.nodes import Nodes, read_nodes
 from bake_core.gltf.placement import place_meshes
-from bake_core.scene import Scene, SceneNode
+from bake_core.gltf.textures import Textures
+from bake_core.scene import NO_TEXTURE, Materials, Scene, SceneNode
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -85,18 +86,25 @@ def _load(document: Document) -> Scene:
         notes.extend(mesh_notes[mesh])
     check_size(sum(outlines[m].triangle_count for m in used), "meshes")
     named = {p.material for m in used for p in outlines[m].primitives}
-    table, row_of = read_materials(root, named, notes)
-    meshes = {m: read_mesh(outlines[m], accessors, row_of) for m in used if outlines[m].primitives}
-    placed = place_meshes(meshes, [(n, m) for n, m in uses if m in meshes], nodes)
+    textures = Textures(document, accessors, notes)
+    table, row_of = read_materials(root, named, textures, notes)
+    for m in used:
+        for p in outlines[m].primitives:
+            _check_texcoords(p, table, row_of[p.material], textures)
+    sets = textures.sets()
+    meshes = {m: read_mesh(outlines[m], accessors, row_of, sets) for m in used if outlines[m].primitives}
+    placed = place_meshes(meshes, [(n, m) for n, m in uses if m in meshes], nodes, len(sets))
     lights = read_lights(root, nodes, placed.origin, notes)
     cameras = read_cameras(root, nodes, notes)
+    looked_at, images = textures.read()
     return Scene(
-        digest=document.digest,
+        digest=document.resources.digest(),
         origin=placed.origin,
         bounds=placed.bounds,
         positions=placed.positions,
         normals=placed.normals,
         colors=placed.colors,
+        uvs=placed.uvs,
         indices=placed.indices,
         triangle_material=placed.triangle_material,
         mesh_first_triangle=placed.mesh_first_triangle,
@@ -106,8 +114,18 @@ def _load(document: Document) -> Scene:
         lights=lights,
         cameras=cameras,
         nodes=tuple(SceneNode(nodes.name(i), i, nodes.world[i]) for i in nodes.in_scene.tolist()),
+        textures=looked_at,
+        images=images,
         ignored=notes.lines(),
     )
+
+
+def _check_texcoords(p: Primitive, table: Materials, row: int, textures: Textures) -> None:
+    """Refuse a primitive that lacks the texture coordinates that its material's textures look at."""
+    for texture in {int(c[row]) for c in (table.base_color_texture, table.metallic_roughness_texture, table.emissive_texture)}:
+        if texture != NO_TEXTURE and textures.number(texture) not in p.texcoords:
+            number, name = textures.number(texture), table.name[row]
+            fail("missing_texcoord", f"a texture of its material {quoted(name)} needs TEXCOORD_{number}, which it does not have", p.where)
 
 
 def _uses(root: Fields, nodes: Nodes, outlines: list[Outline]) -> list[tuple[int, int]]:

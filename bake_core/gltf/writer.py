@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from bake_core.gltf.accessors import FLOAT, UBYTE, UINT, USHORT
 from bake_core.gltf.container import BIN_CHUNK, JSON_CHUNK, MAGIC
 from bake_core.gltf.meshes import TRIANGLES
+from bake_core.gltf.textures import LINEAR, NEAREST
 
 Vec3 = Sequence[float]
+TextureInfo = Mapping[str, Any]
+REPEAT, MIRRORED, CLAMP = 10497, 33648, 33071
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Part:
         What :meth:`GlbWriter.material` gave.
     mode : int
         4 triangles, 5 strip, 6 fan.
+    uvs : sequence of (v, 2) float
+        TEXCOORD_0, TEXCOORD_1, ...
     """
 
     positions: ArrayLike
@@ -42,6 +47,7 @@ class Part:
     colors: ArrayLike | None = None
     material: int | None = None
     mode: int = TRIANGLES
+    uvs: Sequence[ArrayLike] = ()
 
 
 class GlbWriter:
@@ -62,25 +68,55 @@ class GlbWriter:
         roughness: float = 1.0,
         emission: Vec3 = (0.0, 0.0, 0.0),
         double_sided: bool = False,
+        alpha: float = 1.0,
+        alpha_mode: str = "OPAQUE",
+        alpha_cutoff: float | None = None,
+        unlit: bool = False,
+        base_color_texture: TextureInfo | None = None,
+        metallic_roughness_texture: TextureInfo | None = None,
+        emissive_texture: TextureInfo | None = None,
     ) -> int:
         """A material, Lambert unless told otherwise; `emission` is radiance, of any strength."""
-        material: dict[str, Any] = {
-            "name": name,
-            "pbrMetallicRoughness": {
-                "baseColorFactor": [*map(float, base_color), 1.0],
-                "metallicFactor": metallic,
-                "roughnessFactor": roughness,
-            },
+        pbr: dict[str, Any] = {
+            "baseColorFactor": [*map(float, base_color), float(alpha)],
+            "metallicFactor": metallic,
+            "roughnessFactor": roughness,
         }
+        textures = {"baseColorTexture": base_color_texture, "metallicRoughnessTexture": metallic_roughness_texture}
+        material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": pbr | {k: dict(v) for k, v in textures.items() if v is not None}}
+        if emissive_texture is not None:
+            material["emissiveTexture"] = dict(emissive_texture)
+        if alpha_mode != "OPAQUE":
+            material["alphaMode"] = alpha_mode
+        if alpha_cutoff is not None:
+            material["alphaCutoff"] = float(alpha_cutoff)
+        extensions: dict[str, Any] = {}
         strength = max(1.0, *map(float, emission))
         if any(emission):
             material["emissiveFactor"] = [float(e) / strength for e in emission]
         if strength > 1:
-            material["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
-            self._extensions.add("KHR_materials_emissive_strength")
+            extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
+        if unlit:
+            extensions["KHR_materials_unlit"] = {}
+        if extensions:
+            material["extensions"] = extensions
+            self._extensions |= extensions.keys()
         if double_sided:
             material["doubleSided"] = True
         return self._add("materials", material)
+
+    def texture(
+        self, image: bytes, *, wrap: tuple[int, int] = (REPEAT, REPEAT), nearest: bool = False, kind: str = "image/png"
+    ) -> dict[str, Any]:
+        """A texture of an encoded image, as the textureInfo that materials take; add texCoord or extensions to it as needed."""
+        source = self._add("images", {"bufferView": self._view(image), "mimeType": kind})
+        sampler = self._add("samplers", {"magFilter": NEAREST if nearest else LINEAR, "wrapS": wrap[0], "wrapT": wrap[1]})
+        return {"index": self._add("textures", {"source": source, "sampler": sampler})}
+
+    def transformed(self, info: TextureInfo, **transform: Any) -> dict[str, Any]:
+        """A textureInfo with KHR_texture_transform: offset, rotation, scale, texCoord."""
+        self._extensions.add("KHR_texture_transform")
+        return {**info, "extensions": {"KHR_texture_transform": transform}}
 
     def mesh(self, name: str, parts: Sequence[Part]) -> int:
         return self._add("meshes", {"name": name, "primitives": [self._primitive(p) for p in parts]})
@@ -165,6 +201,8 @@ class GlbWriter:
             attributes["NORMAL"] = self._accessor(np.asarray(part.normals, np.float32).reshape(-1, 3), FLOAT)
         if part.colors is not None:
             attributes["COLOR_0"] = self._accessor(np.asarray(part.colors, np.float32), FLOAT)
+        for i, uv in enumerate(part.uvs):
+            attributes[f"TEXCOORD_{i}"] = self._accessor(np.asarray(uv, np.float32).reshape(-1, 2), FLOAT)
         primitive: dict[str, Any] = {"attributes": attributes}
         if part.indices is not None:
             indices = np.asarray(part.indices).reshape(-1)
@@ -175,12 +213,15 @@ class GlbWriter:
             primitive["material"] = part.material
         return primitive | ({"mode": part.mode} if part.mode != TRIANGLES else {})
 
-    def _accessor(self, values: NDArray[Any], component: int, *, bounds: bool = False) -> int:
-        dtype = {UBYTE: "<u1", USHORT: "<u2", UINT: "<u4", FLOAT: "<f4"}[component]
-        data = np.ascontiguousarray(values, dtype).tobytes()
+    def _view(self, data: bytes) -> int:
         self._binary += bytes(-len(self._binary) % 4)
         view = self._add("bufferViews", {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(data)})
         self._binary += data
+        return view
+
+    def _accessor(self, values: NDArray[Any], component: int, *, bounds: bool = False) -> int:
+        dtype = {UBYTE: "<u1", USHORT: "<u2", UINT: "<u4", FLOAT: "<f4"}[component]
+        view = self._view(np.ascontiguousarray(values, dtype).tobytes())
         kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
         accessor: dict[str, Any] = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
         if bounds:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("bake", help="bake a scene here, with no server")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb or .gltf")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf, a zip of its folder, .obj, .ply or .stl")
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True, help="JSON file: volumes, lights, environment, when to stop")
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, required=True, help="a folder, or a zip where it ends in .zip")
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core import bundle
     from bake_core.bake import bake
+    from bake_core.environment import beside
     from bake_core.report import percent
     from bake_core.spec import load_spec
     from service.cli.progress import ProgressLine
@@ -45,7 +46,16 @@ def run(args: argparse.Namespace) -> int:
     previous = signal.signal(signal.SIGINT, lambda *_: cancelled.fill(1))
     line = ProgressLine(sys.stderr)
     try:
-        result = bake(args.scene, spec, args.out, threads=args.threads, shards=args.shards, progress=line, cancelled=cancelled)
+        result = bake(
+            args.scene,
+            spec,
+            args.out,
+            threads=args.threads,
+            shards=args.shards,
+            find=beside(args.spec.parent),
+            progress=line,
+            cancelled=cancelled,
+        )
     finally:
         line.close()
         signal.signal(signal.SIGINT, previous)

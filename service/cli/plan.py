@@ -12,7 +12,7 @@ from service.cli.bake import positive
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("plan", help="what will be baked and left out, with predicted seconds, memory and bytes")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb or .gltf")
+    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, .gltf, a zip of its folder, .obj, .ply or .stl")
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True)
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="threads that the bake will have; default: all cores")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
@@ -23,12 +23,13 @@ def run(args: argparse.Namespace) -> int:
     """Print the plan."""
     from dataclasses import asdict
 
-    from bake_core.gltf.reader import load_scene
+    from bake_core.environment import beside
     from bake_core.plan import plan
+    from bake_core.scene_files import load_scene
     from bake_core.spec import load_spec
 
     spec = load_spec(args.spec)
-    made = plan(load_scene(args.scene), spec, threads=args.threads)
+    made = plan(load_scene(args.scene), spec, threads=args.threads, find=beside(args.spec.parent))
     if args.json:
         print(json.dumps(asdict(made), indent=2))
         return 0

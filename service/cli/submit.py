@@ -13,7 +13,9 @@ from service.cli.remote import add_json, add_server, connect, exit_code, follow
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command."""
     parser = commands.add_parser("submit", help="queue a bake on a service")
-    parser.add_argument("scene", metavar="SCENE", type=Path, help=".glb, or .gltf with its files beside it")
+    parser.add_argument(
+        "scene", metavar="SCENE", type=Path, help=".glb, .gltf with its files beside it, a zip of its folder, .obj, .ply or .stl"
+    )
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True)
     parser.add_argument("--label", metavar="KEY=VALUE", action="append", default=[], type=_label, help="may be given several times")
     parser.add_argument("--priority", metavar="N", type=int, default=0, help="higher goes first")
@@ -29,7 +31,8 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Submit; prints the job's id, and once it has finished its figures."""
-    from bake_core.spec import load_spec
+    from bake_core.environment import beside
+    from bake_core.spec import EquirectEnvironment, load_spec
     from service.cli.fetch import check_out, fetch_bundle
     from service.cli.progress import describe_result
 
@@ -38,6 +41,9 @@ def run(args: argparse.Namespace) -> int:
         check_out(args.fetch)
     with connect(args.server) as client:
         scene = client.add_scene(args.scene)
+        if isinstance(spec.environment, EquirectEnvironment) and not spec.environment.image.startswith("sha256:"):
+            image = client.put_blob(beside(args.spec.parent)(spec.environment.image))
+            spec = spec.model_copy(update={"environment": spec.environment.model_copy(update={"image": image})})
         job = client.submit(scene.digest, spec.canonical(), labels=dict(args.label), priority=args.priority)
         if not (args.wait or args.fetch or args.fail_above_error is not None):
             print(json.dumps(job.document) if args.json else job.id)

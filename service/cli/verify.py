@@ -16,7 +16,7 @@ from service.cli.bake import positive
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("verify", help="render with a bundle and path-traced, and compare")
     parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="a folder or a zip")
-    parser.add_argument("--scene", metavar="SCENE", type=Path, required=True, help="the .glb or .gltf that was baked")
+    parser.add_argument("--scene", metavar="SCENE", type=Path, required=True, help="the scene that was baked")
     parser.add_argument(
         "--camera",
         metavar="FILE",
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core.bundle import read_bundle
     from bake_core.cameras import load_cameras
-    from bake_core.gltf.reader import load_scene
+    from bake_core.scene_files import load_scene
     from bake_core.thresholds import load_thresholds
     from bake_core.verification import verify
     from service.cli.progress import ProgressLine

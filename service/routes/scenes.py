@@ -12,8 +12,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 
-from bake_core.gltf.reader import load_scene_files
 from bake_core.scene import Scene as SceneArrays
+from bake_core.scene_files import load_scene_files
 from service import documents
 from service.parts import Service
 from service.problems import RequestError
@@ -23,6 +23,7 @@ from service.routes.common import Here, failures, unknown
 GLB_TYPES = ("model/gltf-binary", "application/octet-stream", "")
 # What a GLB that is sent as a body is called; its digest does not depend on it.
 GLB_NAME = "scene.glb"
+ZIP_TYPE, ZIP_NAME = "application/zip", "scene.zip"
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -39,26 +40,28 @@ router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
             "required": True,
             "content": {
                 "model/gltf-binary": {"schema": {"type": "string", "format": "binary"}},
+                ZIP_TYPE: {"schema": {"type": "string", "format": "binary"}},
                 "application/json": {"schema": {"$ref": "#/components/schemas/SceneRequest"}},
             },
         }
     },
 )
 async def create_scene(request: Request, service: Here) -> Response:
-    """Read a scene strictly, and keep it: a GLB as the body, or JSON that names blobs uploaded before."""
+    """Read a scene strictly, and keep it: a GLB or a zip of a glTF's folder as the body, or JSON that names blobs uploaded before."""
     kind = media_type(request)
     if kind == "application/json":
         body = await read_json(request, service.settings.max_json_bytes)
         return await run_in_threadpool(_from_blobs, service, body)
-    if kind not in GLB_TYPES:
-        text = "send a GLB as model/gltf-binary, or names of blobs as application/json"
+    if kind not in (*GLB_TYPES, ZIP_TYPE):
+        text = "send a GLB as model/gltf-binary, a zip as application/zip, or names of blobs as application/json"
         raise RequestError("request.unsupported_media_type", text, "Content-Type", 415)
     with service.blobs.upload() as upload:
         await receive(request, upload, service.settings.max_upload_bytes)
-        scene = await run_in_threadpool(load_scene_files, GLB_NAME, {GLB_NAME: upload.path})
+        name = ZIP_NAME if kind == ZIP_TYPE else GLB_NAME
+        scene = await run_in_threadpool(load_scene_files, name, {name: upload.path})
         await run_in_threadpool(upload.keep)
         await run_in_threadpool(service.store.add_blob, upload.digest, upload.size)
-        return await run_in_threadpool(_add, service, GLB_NAME, {GLB_NAME: upload.digest}, scene)
+        return await run_in_threadpool(_add, service, name, {name: upload.digest}, scene)
 
 
 @router.get("/{digest}", operation_id="getScene", summary="What is in a scene", responses=failures(404))

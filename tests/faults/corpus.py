@@ -7,15 +7,21 @@ from __future__ import annotations
 
 import base64
 import copy
+import io
 import json
 import os
 import struct
+import warnings
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bake_core.gltf.writer import GlbWriter, Part, pack_glb
+from tests.pictures import png, png_header
 
 Json = dict[str, Any]
 GLB, GLTF = "scene.glb", "scene.gltf"
@@ -69,7 +75,8 @@ class Fault:
 
 def corpus() -> list[Fault]:
     """Every fault, in a fixed order."""
-    return [*_containers(), *_json_faults(), *_uri_faults(), *_field_faults(), *_data_faults(), *_unsupported()]
+    gltf = [*_containers(), *_json_faults(), *_uri_faults(), *_field_faults(), *_data_faults(), *_texture_faults(), *_unsupported()]
+    return [*gltf, *_zip_faults(), *_mesh_faults()]
 
 
 def sound() -> tuple[Json, bytes]:
@@ -562,25 +569,102 @@ def _data_faults() -> Iterator[Fault]:
     yield _glb("one index list 2,000 times", "too_large", "meshes", pack_glb(_dump(many), bytes(w._binary)))
 
 
+def _texture_faults() -> Iterator[Fault]:
+    """Textures, samplers, images, alpha and texture coordinates."""
+    base = "materials[0].pbrMetallicRoughness.baseColorTexture"
+    picture = png(np.full((2, 2, 4), 128, np.uint8))
+
+    def of(
+        name: str, slug: str, where: str, *edits: tuple[str, Any], image: bytes = picture, files: Mapping[str, bytes] | None = None
+    ) -> Fault:
+        """A textured square; its fields as in :func:`changed`."""
+        w = GlbWriter()
+        info = w.transformed(w.texture(image), offset=[0.5, 0])
+        part = Part([[0, 0, 0], [1, 0, 0], [1, 1, 0]], material=w.material("m", base_color_texture=info), uvs=[[[0, 0], [1, 0], [1, 1]]])
+        w.node(mesh=w.mesh("m", [part]))
+        document = w.document()
+        for path, value in edits:
+            _put(document, path, value)
+        glb = pack_glb(_dump(document), bytes(w._binary))
+        return Fault(name, f"gltf.{slug}", where, {GLB: glb, **(files or {})})
+
+    texture = "materials/0/pbrMetallicRoughness/baseColorTexture"
+    transform = f"{texture}/extensions/KHR_texture_transform"
+    for path, where in (
+        (f"{texture}/index", f"{base}.index"),
+        ("textures/0/source", "textures[0].source"),
+        ("textures/0/sampler", "textures[0].sampler"),
+        ("images/0/bufferView", "images[0].bufferView"),
+    ):
+        yield of(f"{where} out of range", "index_out_of_range", where, (path, 7))
+    value: Any
+    for path, where, value in (
+        (f"{texture}/texCoord", f"{base}.texCoord", -1),
+        ("samplers/0/wrapS", "samplers[0].wrapS", 10496),
+        ("samplers/0/wrapT", "samplers[0].wrapT", 0),
+        ("samplers/0/magFilter", "samplers[0].magFilter", 9987),
+        ("samplers/0/minFilter", "samplers[0].minFilter", 1),
+        (f"{transform}/texCoord", f"{base}.extensions.KHR_texture_transform.texCoord", -1),
+        (f"{transform}/scale", f"{base}.extensions.KHR_texture_transform.scale[1]", [1, 1e300]),
+        ("materials/0/pbrMetallicRoughness/baseColorFactor", "materials[0].pbrMetallicRoughness.baseColorFactor[3]", [1, 1, 1, 1.5]),
+    ):
+        yield of(f"{where} is {value}", "out_of_range", where, (path, value))
+    for path, where, value in (
+        (texture, base, 0),
+        (f"{texture}/index", f"{base}.index", "0"),
+        (f"{texture}/texCoord", f"{base}.texCoord", 0.5),
+        (f"{transform}/offset", f"{base}.extensions.KHR_texture_transform.offset", [1]),
+        (f"{transform}/rotation", f"{base}.extensions.KHR_texture_transform.rotation", "90°"),
+        ("images/0/mimeType", "images[0].mimeType", 1),
+        ("materials/0/alphaMode", "materials[0].alphaMode", 1),
+    ):
+        yield of(f"{where} is {value!r}", "wrong_type", where, (path, value))
+    yield of("a texture without an index", "missing_key", f"{base}.index", (texture, {}))
+    yield of("an image in a bufferView without a mimeType", "missing_key", "images[0].mimeType", ("images/0/mimeType", _REMOVE))
+    yield of("an image with neither uri nor bufferView", "bad_texture", "images[0]", ("images/0", {}))
+    yield of("an image with uri and bufferView", "bad_texture", "images[0]", ("images/0/uri", "a.png"))
+    yield of("a texture without a source", "unsupported_image", "textures[0]", ("textures/0/source", _REMOVE))
+    basisu = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    yield of("a texture of KTX2 alone", "unsupported_image", "textures[0]", ("textures/0", basisu))
+    yield of("an image of another type", "unsupported_image", "images[0].mimeType", ("images/0/mimeType", "image/webp"))
+    yield of("a set of coordinates that is not there", "missing_texcoord", "meshes[0].primitives[0]", (f"{texture}/texCoord", 1))
+    override = (f"{transform}/texCoord", 3)
+    yield of("a set that only KHR_texture_transform names", "missing_texcoord", "meshes[0].primitives[0]", override)
+    uv = "meshes/0/primitives/0/attributes/TEXCOORD_0"
+    yield of("a textured mesh without coordinates", "missing_texcoord", "meshes[0].primitives[0]", (uv, _REMOVE))
+    for name, data in (
+        ("an empty image", b"\0"),
+        ("a GIF", b"GIF89a" + bytes(64)),
+        ("a PNG of its signature alone", picture[:8]),
+        ("a PNG cut in its header", picture[:20]),
+        ("a PNG cut in its data", picture[:-20]),
+        ("a PNG with a wrong CRC", picture[:45] + bytes([picture[45] ^ 255]) + picture[46:]),
+        ("a PNG of 2^30 × 2^30 texels", png_header(1 << 30, 1 << 30) + picture[33:]),
+        ("a JPEG of its signature alone", b"\xff\xd8\xff\xe0" + bytes(16)),
+    ):
+        yield of(name, "bad_image", "images[0]", image=data)
+    large = png_header(1 << 13, (1 << 13) + 1) + picture[33:]
+    yield of("a PNG of more than 2^26 texels", "images_too_large", "images[0]", image=large)
+    quarter = png_header(1 << 13, 1 << 13) + picture[33:]
+    w = GlbWriter()
+    triangle = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+    materials = [w.material(f"m{i}", base_color_texture=w.texture(quarter)) for i in range(5)]
+    w.node(mesh=w.mesh("m", [Part(triangle, material=m, uvs=[[[0, 0], [1, 0], [1, 1]]]) for m in materials]))
+    yield _glb("images of more than 2^28 texels together", "images_too_large", "images[4]", w.to_glb())
+    yield of("an image file that is not there", "missing_file", "images[0].uri", ("images/0", {"uri": "a.png"}))
+    from_file = ("images/0", {"uri": "a.png"})
+    yield of("an image file that is no image", "bad_image", "image 'a.png' (images[0])", from_file, files={"a.png": b"no"})
+    yield of("a data: URI that is no image", "bad_image", "images[0]", ("images/0", {"uri": "data:image/png;base64,QUJD"}))
+    quantized = ("accessors/0/componentType", 5120), ("accessors/0/count", 3)
+    yield of("bytes for positions without KHR_mesh_quantization", "bad_accessor", "meshes[0].primitives[0].attributes.POSITION", *quantized)
+
+
 def _unsupported() -> Iterator[Fault]:
     """What is sound glTF, but not read yet: refused by name."""
-    for name in ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization", "VENDOR_secret", "KHR_materials_unlit"):
+    for name in ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "VENDOR_secret"):
         required = (("extensionsRequired", [name]), ("extensionsUsed", [name]))
         yield _edit(f"requires {name}", "unsupported_extension", "extensionsRequired[0]", *required)
-    texture = {"index": 0}
-    textures = ("textures", [{"source": 0}])
-    for path in (
-        "pbrMetallicRoughness/baseColorTexture",
-        "pbrMetallicRoughness/metallicRoughnessTexture",
-        "normalTexture",
-        "emissiveTexture",
-    ):
-        where = f"materials[0].{path.replace('/', '.')}"
-        yield _edit(f"a {path.rpartition('/')[2]}", "unsupported_texture", where, (f"materials/0/{path}", texture), textures)
-    for mode in ("MASK", "BLEND"):
-        yield _edit(f"alphaMode {mode}", "unsupported_alpha_mode", "materials[0].alphaMode", ("materials/0/alphaMode", mode))
     for where, path in (
-        ("materials[0].extensions.KHR_materials_unlit", "materials/0/extensions/KHR_materials_unlit"),
         (
             "meshes[0].primitives[0].extensions.KHR_draco_mesh_compression",
             "meshes/0/primitives/0/extensions/KHR_draco_mesh_compression",
@@ -594,3 +678,83 @@ def _unsupported() -> Iterator[Fault]:
     yield _edit("morph targets", "unsupported_morph_targets", "meshes[0].primitives[0].targets", targets)
     yield _edit("morph weights of a mesh", "unsupported_morph_targets", "meshes[0].weights", ("meshes/0/weights", [0.5]))
     yield _edit("morph weights of a node", "unsupported_morph_targets", "nodes[0].weights", ("nodes/0/weights", [0.5]))
+
+
+def make_zip(entries: Mapping[str, bytes] | list[tuple[str | zipfile.ZipInfo, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """A zip of these files, in their order, with fixed dates."""
+    out = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(out, "w", method) as archive:
+        # Of names that occur twice, which is what some faults are about.
+        warnings.simplefilter("ignore")
+        for name, data in entries.items() if isinstance(entries, Mapping) else entries:
+            info = name if isinstance(name, zipfile.ZipInfo) else zipfile.ZipInfo(name)
+            info.compress_type = method
+            archive.writestr(info, data)
+    return out.getvalue()
+
+
+def _zip_faults() -> Iterator[Fault]:
+    glb = changed()
+    name = "scene.zip"
+
+    def of(what: str, slug: str, where: str, data: bytes) -> Fault:
+        return Fault(what, slug, where, {name: data}, name)
+
+    sound_zip = make_zip({"room/scene.glb": glb})
+    yield of("a zip without a scene", "scene.no_root", name, make_zip({"readme.txt": b"hello"}))
+    yield of("a zip with two scenes", "scene.no_root", name, make_zip({"a.glb": glb, "b/b.gltf": b"{}"}))
+    yield of("a zip of a Mac's metadata alone", "scene.no_root", name, make_zip({"__MACOSX/._a.glb": glb}))
+    yield of("a zip cut off", "scene.bad_zip", name, sound_zip[:-30])
+    damaged = bytearray(sound_zip)
+    damaged[80] ^= 0xFF
+    yield of("a zip with damaged data", "scene.bad_zip", name, bytes(damaged))
+    for path in ("../a.glb", "/a.glb", "a/../b.glb", "a\\b.glb", "C:/a.glb", "a//b.glb", "./a.glb", "a\n.glb"):
+        info = zipfile.ZipInfo("x")
+        info.filename = path
+        yield of(f"a zip with a file called {path!r}", "scene.unsafe_zip", f"{name}: {path!r}", make_zip([(info, glb)]))
+    link = zipfile.ZipInfo("a.glb")
+    link.external_attr = 0o120777 << 16
+    yield of("a zip with a link", "scene.unsafe_zip", f"{name}: 'a.glb'", make_zip([(link, b"/etc/passwd")]))
+    yield of("a zip that holds a name twice", "scene.bad_zip", f"{name}: 'a.glb'", make_zip([("a.glb", glb), ("a.glb", glb)]))
+    yield of("a zip packed by another method", "scene.bad_zip", f"{name}: 'a.glb'", make_zip({"a.glb": glb}, zipfile.ZIP_LZMA))
+    encrypted = bytearray(make_zip({"a.glb": glb}))
+    encrypted[6] |= 1
+    encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
+    yield of("an encrypted zip", "scene.bad_zip", f"{name}: 'a.glb'", bytes(encrypted))
+    yield of("a zip bomb", "scene.zip_too_large", name, make_zip({"a.glb": glb, "b.bin": bytes(1 << 24)}))
+    huge = bytearray(make_zip({"a.glb": glb, "b.bin": b"x"}))
+    at = huge.rindex(b"PK\x01\x02")
+    huge[at + 24 : at + 28] = struct.pack("<I", 0xFFFFFFF0)
+    yield of("a zip that says it holds 4 GiB", "scene.zip_too_large", name, bytes(huge))
+    many = make_zip({"a.glb": glb, **{f"{i}.txt": b"" for i in range(4096)}}, zipfile.ZIP_STORED)
+    yield of("a zip of too many files", "scene.zip_too_large", name, many)
+    lying = bytearray(make_zip({"a.glb": glb}))
+    at = lying.index(b"PK\x01\x02")
+    lying[at + 24 : at + 28] = struct.pack("<I", len(glb) - 8)
+    yield of("a zip with a file longer than it says", "scene.bad_zip", name, bytes(lying))
+    inside = make_zip({"a.glb": changed(("nodes/0/mesh", 99))})
+    yield of("a zip of a bad scene", "gltf.index_out_of_range", "nodes[0].mesh", inside)
+    gltf, binary = sound()
+    gltf["buffers"][0]["uri"] = "../scene.bin"
+    outside = make_zip({"room/scene.gltf": _dump(gltf), "scene.bin": binary})
+    yield of("a zip whose scene looks above its folder", "gltf.unsafe_uri", "buffers[0].uri", outside)
+    yield of("a zip in a zip", "scene.no_root", name, make_zip({"scene.zip": sound_zip}))
+
+
+def _mesh_faults() -> Iterator[Fault]:
+    def of(what: str, name: str, data: bytes) -> Fault:
+        return Fault(what, "scene.bad_mesh", name, {name: data}, name)
+
+    yield of("an empty OBJ", "a.obj", b"")
+    yield of("an OBJ of points", "a.obj", b"v 0 0 0\nv 1 0 0\n")
+    yield of("an OBJ that names a vertex too many", "a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+    yield of("an OBJ with NaN", "a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    yield of("an OBJ beyond 1e18 m", "a.obj", b"v 0 0 1e30\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    yield of("an OBJ of two coordinates", "a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    yield of("an empty STL", "a.stl", b"solid x\nendsolid x\n")
+    yield of("an STL of nothing", "a.stl", bytes(90))
+    yield of("a PLY cut in its header", "a.ply", b"ply\nformat ascii 1.0\nelement vertex 3")
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 2000000000\nproperty float x\nproperty float y\nproperty float z\n"
+    yield of("a PLY of 2e9 vertices", "a.ply", header + b"element face 1\nproperty list uchar int vertex_indices\nend_header\n")
+    yield of("a GLB called .ply", "a.ply", changed())
+    yield Fault("a mesh that is not there", "gltf.missing_file", "a.stl", {}, "a.stl", folders=("a.stl",))

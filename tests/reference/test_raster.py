@@ -13,9 +13,10 @@ import pytest
 from bake_core import examples
 from bake_core.bundle import VolumeData
 from bake_core.cameras import looking
+from bake_core.environment import Environment, no_images, read_environment
 from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter, Part
-from bake_core.lights import environment_radiance, merge_lights
+from bake_core.lights import merge_lights
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.raster import Rasterizer
 from bake_core.scene import Camera, Scene
@@ -40,6 +41,10 @@ def spec_of(lights: Sequence[dict[str, Any]] = (), environment: Sequence[float] 
     return parse_spec({"volumes": [volume], "lights": list(lights), "environment": {"kind": "constant", "radiance": list(environment)}})
 
 
+def surroundings(spec: Spec) -> Environment:
+    return read_environment(spec.environment, no_images)[0]
+
+
 def constant_volume(irradiance: Sequence[float]) -> VolumeData:
     volume = synthetic.volume("all", (0, 0, 0), (1, 1, 1), (1, 1, 1), visibility=False)
     whole = np.broadcast_to(np.asarray(irradiance, np.float64), (1, 4, 4, 3))
@@ -49,7 +54,7 @@ def constant_volume(irradiance: Sequence[float]) -> VolumeData:
 
 def raster(scene: Scene, spec: Spec, camera: Camera, volume: VolumeData, width: int = 96, height: int = 54) -> Picture:
     with Device() as device:
-        rasterizer = Rasterizer(device, scene, merge_lights(scene, spec), environment_radiance(spec), [volume])
+        rasterizer = Rasterizer(device, scene, merge_lights(scene, spec), surroundings(spec).constant, [volume])
         return rasterizer.render(camera, width, height)
 
 
@@ -58,7 +63,8 @@ def eye(position: Sequence[float], target: Sequence[float], yfov: float = 0.9) -
 
 
 def both(scene: Scene, spec: Spec, camera: Camera, samples: int = 256) -> tuple[Picture, Picture]:
-    traced = path_trace_picture(Tracer.build(scene, spec), camera, 96, 54, samples=samples, seed=3, max_bounces=1, threads=THREADS)
+    tracer = Tracer.build(scene, spec, surroundings(spec))
+    traced = path_trace_picture(tracer, camera, 96, 54, samples=samples, seed=3, max_bounces=1, threads=THREADS)
     return raster(scene, spec, camera, constant_volume((0, 0, 0))), traced
 
 

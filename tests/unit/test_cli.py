@@ -121,7 +121,10 @@ def test_every_bad_scene_is_2_with_its_slug_and_leaves_nothing(fault: Fault, tmp
         ('{"volumes": [{"fit": "scene", "counts": [4096, 4096, 2]}]}', "spec.too_many_probes"),
         ('{"volumes": [{"fit": "scene", "spacing": [1e-9, 1, 1]}]}', "spec.too_many_probes"),
         ('{"volumes": [{"fit": "node", "node": "none", "counts": [1, 1, 1]}]}', "spec.unknown_node"),
-        ('{"volumes": [{"fit": "scene", "counts": [2, 2, 2]}], "environment": {"kind": "equirect", "image": "a.exr"}}', "spec.unsupported"),
+        (
+            '{"volumes": [{"fit": "scene", "counts": [2, 2, 2]}], "environment": {"kind": "equirect", "image": "a.exr"}}',
+            "spec.image_not_found",
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["bake", "plan"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bake_core.errors import SceneError
-from bake_core.gltf.reader import load_scene, load_scene_files
+from bake_core.scene_files import load_scene, load_scene_files
 from tests.faults.corpus import Fault, changed, corpus
 
 FAULTS = corpus()

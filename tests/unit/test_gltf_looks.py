@@ -38,11 +38,12 @@ def test_default_materials_and_occlusion(tmp_path: Path) -> None:
     raw = Raw()
     position = raw.accessor(TRIANGLE)
     primitives = [{"attributes": {"POSITION": position}, "material": 0}, {"attributes": {"POSITION": position}}]
-    materials = [{"occlusionTexture": {"index": 0}}]
+    materials = [{"occlusionTexture": {"index": 0}, "normalTexture": {"index": 0, "scale": 2}}]
     scene = raw.load(tmp_path, meshes=[{"primitives": primitives}], materials=materials, textures=[{}])
     assert scene.materials.name == ("materials[0]", "(default)")
     assert scene.materials.metallic.tolist() == scene.materials.roughness.tolist() == [1, 1]
-    assert len(scene.ignored) == 1 and scene.ignored[0].startswith("occlusionTexture")
+    assert [line.partition(" ")[0] for line in scene.ignored] == ["normalTexture", "occlusionTexture"]
+    assert not scene.images and not scene.textures
 
 
 def test_lights(tmp_path: Path) -> None:

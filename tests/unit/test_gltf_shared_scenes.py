@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from bake_core.errors import SceneError
 from bake_core.gltf.reader import load_scene
+from bake_core.scene import ALPHA_MASK, ALPHA_OPAQUE, NO_TEXTURE
 from tests.unit.gltf_build import face_normals, world_triangles
 
 TRIANGLES = {
@@ -23,6 +23,7 @@ TRIANGLES = {
     "bevy_irradiance_volume": 32,
     "godot_zdm2": 58_772,
     "atrium": 289_368,
+    "playcanvas_house": 10_497,
 }
 
 
@@ -94,11 +95,17 @@ def test_cornell_walls_face_inwards(shared: Path) -> None:
         assert wall.any() and (normals[wall][:, axis] * side < 0).any()
 
 
-def test_textured_house_is_refused_by_name(shared: Path) -> None:
-    with pytest.raises(SceneError) as caught:
-        load_scene(shared / "scenes" / "playcanvas_house.glb")
-    assert caught.value.slug == "gltf.unsupported_texture"
-    assert caught.value.where == "materials[1].pbrMetallicRoughness.baseColorTexture"
+def test_textured_house_is_cut_out_and_textured(shared: Path) -> None:
+    scene = load_scene(shared / "scenes" / "playcanvas_house.glb")
+    m = scene.materials
+    assert m.name == ("White", "WhiteAlpha")
+    assert m.alpha_mode.tolist() == [ALPHA_OPAQUE, ALPHA_MASK] and m.alpha_cutoff[1] == 0.5
+    assert m.base_color_texture.tolist() == [NO_TEXTURE, 0] and m.lambert.all()
+    # Only the first of its two sets of texture coordinates is looked at.
+    assert scene.uvs.shape == (len(scene.positions), 2)
+    (image,) = scene.images
+    alpha = image.pixels[..., 3]
+    assert 0 < (alpha >= 128).mean() < 1
 
 
 def test_bevy_volume_node(shared: Path) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.materials import lambert_cosine, material_table, sample_lambert
-from tests.scenes import square_scene
+from bake_core.materials import lambert_cosine, sample_lambert
 from tests.unit.test_octahedral import quadrature, sphere
 from tests.unit.test_sampling import chi_squared, most, uniform
 
@@ -73,13 +72,3 @@ def test_is_drawn_with_its_density(ng: tuple[float, ...], ns: tuple[float, ...])
     full = expected > 5
     assert counts[~full].sum() < 10 + 3 * expected[~full].sum()
     assert chi_squared(counts[full], expected[full]) < most(int(full.sum()))
-
-
-def test_what_is_not_lambert_yet_is_refused_by_name() -> None:
-    from bake_core.errors import SceneError
-
-    with pytest.raises(SceneError) as caught:
-        material_table(square_scene(metallic=1.0))
-    assert caught.value.slug == "scene.unsupported" and "material 'square'" in caught.value.where
-    with pytest.raises(SceneError):
-        material_table(square_scene(roughness=0.5))
