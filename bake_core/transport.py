@@ -494,7 +494,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                 emitted_r, emitted_g, emitted_b = radiance
                 light_pdf = sky_pdf
             else:
-                # Rounding may put a direction where its own density is 0.
+                # Along the surface itself both may be 0.
                 gain = pdf / (pdf + sky_pdf) if sky_pdf > 0 else 1.0
                 indirect_r += beta_r / survival * (gain * radiance[0])
                 indirect_g += beta_g / survival * (gain * radiance[1])
@@ -577,7 +577,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         if glossy:
             dx, dy, dz = sample_gloss(t, look, np.float64(bsdf_u), np.float64(bsdf_v), n)
             fr, fg, fb, pdf = scattered(t, glossy, look, dx, dy, dz, n)
-            if fr + fg + fb <= 0:
+            if pdf <= 0 or fr + fg + fb <= 0:
                 break
             beta_r *= fr / pdf
             beta_g *= fg / pdf

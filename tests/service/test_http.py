@@ -8,10 +8,8 @@ import json
 from collections.abc import AsyncIterator
 from typing import Any
 
-import numpy as np
 import pytest
 
-from bake_core.gltf.writer import GlbWriter, Part
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
@@ -346,7 +344,6 @@ def test_unknown_not_yet_and_never_are_different(http: InProcess, service: Servi
     answer = http.get(f"/v1/bakes/{job}/bundle")
     problem(answer, 409, "job.no_result")
     assert "retry-after" not in answer.headers
-
 
 
 def test_a_verification_needs_a_finished_bake(http: InProcess, service: Service) -> None:
