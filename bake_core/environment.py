@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bake_core.errors import SpecError
 from bake_core.images import read_radiance
-from bake_core.kernels import either, kernel
+from bake_core.kernels import either, entry_kernel, kernel
 from bake_core.lights import choose
 from bake_core.spec import ConstantEnvironment, EquirectEnvironment
 
@@ -73,9 +73,24 @@ def beside(folder: Path) -> Find:
     return find
 
 
+def exactly(path: Path) -> Find:
+    """One image, whatever its name, for a spec that names it by digest: a bundle's."""
+
+    def find(image: str) -> Path:
+        try:
+            digest = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+        except OSError as e:
+            raise SpecError("spec.image_not_found", f"cannot be read: {e.strerror}", str(path)) from None
+        if digest != image:
+            raise SpecError("spec.other_image", f"is {digest}, the spec's is {image}; give that image", str(path))
+        return path
+
+    return find
+
+
 def no_images(image: str) -> Path:
     """Where there is no place to look for images."""
-    raise SpecError("spec.image_not_found", f"{image!r} cannot be looked up here", "environment.image")
+    raise SpecError("spec.image_not_found", f"{image!r} cannot be looked up here; say where the image is", "environment.image")
 
 
 def read_environment(
@@ -179,6 +194,19 @@ def sample_sky(sky, u, v):  # type: ignore[no-untyped-def]
         (r * math.sin(phi), y, -r * math.cos(phi)),
         _pdf(sky, row, column),
     )
+
+
+@entry_kernel
+def _look_up(sky, directions, out):  # type: ignore[no-untyped-def]
+    for i in range(directions.shape[0]):
+        (out[i, 0], out[i, 1], out[i, 2]), _ = sky_radiance(sky, directions[i, 0], directions[i, 1], directions[i, 2])
+
+
+def look_up_sky(sky: Sky, directions: F64) -> F64:
+    """Radiance that arrives from unit directions, (n, 3) float64."""
+    out = np.empty((len(directions), 3))
+    _look_up(sky, np.ascontiguousarray(directions), out)
+    return out
 
 
 # The kernels below take :class:`bake_core.transport.Tables`.

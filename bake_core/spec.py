@@ -93,7 +93,10 @@ class ConstantEnvironment(_Model):
 
 
 class EquirectEnvironment(_Model):
-    """A latitude-longitude image: the middle column faces -Z before `rotation_y` (radians), the top row is +Y."""
+    """A latitude-longitude image, EXR or Radiance HDR: the top row is +Y, the middle column faces -Z, the right half +X.
+
+    `rotation_y` turns it about +Y, in radians, counter-clockwise as seen from above. Texels are not interpolated.
+    """
 
     kind: Literal["equirect"]
     image: Annotated[str, Field(min_length=1)]

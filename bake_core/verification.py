@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 import shutil
 import time
 import uuid
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from bake_core.automatic_cameras import automatic_cameras
 from bake_core.bundle import Bundle, content_digest, dump_json
 from bake_core.comparison import Figures, compare
-from bake_core.environment import no_images, read_environment
+from bake_core.environment import Find, Sky, look_up_sky, no_images, read_environment
 from bake_core.errors import BundleError, InputError
 from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
@@ -36,6 +38,8 @@ WIDTH, HEIGHT, SAMPLES = 640, 360, 128
 LARGEST_SIDE, MOST_SAMPLES = 8192, 1 << 20
 # The two halves of the reference.
 _SEEDS = (0x0C70BA4E, 0x0C70BA4F)
+# Along each side of a pixel that shows sky.
+_SKY_POINTS = 4
 
 
 def verify(
@@ -49,6 +53,7 @@ def verify(
     samples: int = SAMPLES,
     threads: int = 1,
     thresholds: Thresholds | None = None,
+    find: Find = no_images,
     progress: ProgressCallback | None = None,
     cancelled: NDArray[np.uint8] | None = None,
 ) -> dict[str, Any]:
@@ -68,6 +73,8 @@ def verify(
         Paths a pixel of the reference, both halves together; even.
     thresholds : Thresholds, optional
         Default: those of :class:`Thresholds`.
+    find : callable, optional
+        Where the image of the sky lies, where the bake had one.
     cancelled : (1,) uint8, optional
         Set from any thread to stop.
 
@@ -95,7 +102,7 @@ def verify(
     check_drawable(scene)
     tell = _Teller(progress)
     tell("building", 0.0)
-    tracer = Tracer.build(scene, spec, read_environment(spec.environment, no_images)[0])
+    tracer = Tracer.build(scene, spec, read_environment(spec.environment, find)[0])
     work = out.with_name(f".{out.name}.{uuid.uuid4().hex}")
     work.mkdir()
     try:
@@ -107,6 +114,8 @@ def verify(
             for i, (camera, name) in enumerate(zip(cameras, _file_names(cameras), strict=True)):
                 begun = time.perf_counter()
                 raster = rasterizer.render(camera, width, height)
+                if tracer.tables.sky is not None:
+                    raster = _before(raster, tracer.tables.sky, camera)
                 rastered = time.perf_counter()
                 halves = _halves(tracer, camera, width, height, samples, spec, threads, tell.part(i, len(cameras)), cancelled)
                 seconds = {"raster": rastered - begun, "path": time.perf_counter() - rastered}
@@ -133,6 +142,21 @@ def verify(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return report
+
+
+def _before(raster: Picture, sky: Sky, camera: Camera) -> Picture:
+    """A picture with the sky where it shows nothing: even points of every pixel, as the rasteriser leaves it black."""
+    height, width = raster.hit.shape
+    half = math.tan(camera.yfov / 2)
+    steps = (np.arange(_SKY_POINTS) + 0.5) / _SKY_POINTS
+    behind = np.zeros((height * width, 3))
+    for v, u in itertools.product(steps, steps):
+        x = ((np.arange(width) + u) / width * 2 - 1) * half * width / height
+        y = (1 - (np.arange(height) + v) / height * 2) * half
+        rays = np.stack(np.broadcast_arrays(x, y[:, None], -1.0), -1).reshape(-1, 3) @ camera.matrix[:3, :3].T
+        behind += look_up_sky(sky, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    seen = (behind / len(steps) ** 2).reshape(height, width, 3) * (1 - raster.hit[..., None])
+    return replace(raster, emission=(raster.emission + seen).astype(np.float32))
 
 
 def _check_request(width: int, height: int, samples: int, out: Path) -> None:

@@ -23,6 +23,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         type=Path,
         help='[{"name", "position", "target", "up"?, "yfov"?}]; default: the scene\'s, else automatic',
     )
+    parser.add_argument("--sky", metavar="FILE", type=Path, help="the image that was baked with, where the environment is one")
     parser.add_argument("--thresholds", metavar="FILE", type=Path, help="limits other than the Cornell box's")
     parser.add_argument("-o", "--out", metavar="DIR", type=Path, required=True, help="pictures, verification.json and index.html go here")
     parser.add_argument("--width", type=positive, default=640, help="pixels; default 640")
@@ -39,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core.bundle import read_bundle
     from bake_core.cameras import load_cameras
+    from bake_core.environment import exactly, no_images
     from bake_core.scene_files import load_scene
     from bake_core.thresholds import load_thresholds
     from bake_core.verification import verify
@@ -61,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
             samples=args.samples,
             threads=args.threads,
             thresholds=thresholds,
+            find=exactly(args.sky) if args.sky else no_images,
             progress=line,
             cancelled=cancelled,
         )

@@ -11,7 +11,7 @@ import pytest
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
-from bake_core.environment import Sky, beside, make_sky, read_environment, sample_sky, sky_radiance
+from bake_core.environment import Sky, beside, exactly, make_sky, read_environment, sample_sky, sky_radiance
 from bake_core.errors import SpecError
 from bake_core.images import write_exr
 from bake_core.kernels import entry_kernel
@@ -165,3 +165,14 @@ def test_other_faults(tmp_path: Path) -> None:
         assert str(tmp_path) not in str(e.value)
     with pytest.raises(SpecError, match="beyond float32"):
         read(tmp_path, "sky.exr", scale=1e30, rotation_y=1.0)
+
+
+def test_a_bundle_s_sky_must_be_that_one(tmp_path: Path) -> None:
+    for name, value in (("one.exr", 1.0), ("two.exr", 2.0)):
+        write_exr(tmp_path / name, np.full((4, 8, 3), value, np.float32), ("R", "G", "B"))
+    _, named = read_environment(EquirectEnvironment(kind="equirect", image="one.exr"), beside(tmp_path))
+    assert read_environment(named, exactly(tmp_path / "one.exr"))[1] == named
+    for other, slug in (("two.exr", "spec.other_image"), ("none.exr", "spec.image_not_found")):
+        with pytest.raises(SpecError) as e:
+            read_environment(named, exactly(tmp_path / other))
+        assert e.value.slug == slug
