@@ -14,20 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.errors import SceneError
-from bake_core.lights import cone_ramps
 from bake_core.picture import Picture
 from bake_core.probe_textures import probe_module, probe_textures
-from bake_core.scene import ALPHA_BLEND, ALPHA_MASK, NO_TEXTURE, Camera, Lights, Scene
+from bake_core.scene import Camera, Lights, Scene
+from bake_core.scene_buffers import light_buffer, material_buffers, mesh_buffers
 from bake_core.shader_compiler import compile_glsl, shader_text
 from bake_core.shadow_views import NEAR, Batch, batches, corners, view_matrices
-from bake_core.vulkan import Bindings, Buffer, Commands, Device, Draw, Image, color_target, depth_target, graphics_pipeline, storage
+from bake_core.textures import TextureTable
+from bake_core.vulkan import Bindings, Buffer, Commands, Device, Image, color_target, depth_target, graphics_pipeline, storage
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# Bindings of verification/scene.glsl and picture.frag; the volumes' textures follow.
-_FIRST_PROBE_BINDING = 10
+# Bindings of shaders/verification; the volumes' textures follow.
+_FIRST_PROBE_BINDING = 15
 # Samples a pixel: silhouettes and shadows then err by a sixteenth of a pixel, about what the path tracer's noise leaves of them.
 PIXEL_SAMPLES = 16
 
@@ -39,16 +38,25 @@ class Rasterizer:
     ----------
     device : Device
     scene : Scene
-        One that :func:`check_drawable` lets pass.
     lights : Lights
         All that shine, the spec's included, in the scene's local frame.
     environment : (3,) float
         Radiance of the background.
     volumes : sequence of VolumeData
         Each with an irradiance atlas.
+    textures : TextureTable or None
+        The scene's, as :func:`bake_core.textures.texture_table` makes it.
     """
 
-    def __init__(self, device: Device, scene: Scene, lights: Lights, environment: ArrayLike, volumes: Sequence[VolumeData]) -> None:
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        lights: Lights,
+        environment: ArrayLike,
+        volumes: Sequence[VolumeData],
+        textures: TextureTable | None,
+    ) -> None:
         self._device = device
         self._origin = scene.origin
         self._bounds = scene.bounds - scene.origin
@@ -60,26 +68,23 @@ class Rasterizer:
         layers = max((b.views for b in self._batches), default=1)
         self._shadows = depth_target(device, size, size, layers, sampled=True)
         self._views = storage(device, layers * 128)
-        self._draws, transforms = _draws(scene)
+        meshes, self._draws = mesh_buffers(device, scene)
         resources: list[Buffer | Image] = [
-            storage(device, scene.positions),
-            storage(device, scene.normals),
-            storage(device, scene.colors),
-            storage(device, scene.indices),
-            storage(device, _triangles(scene)),
-            storage(device, transforms),
-            storage(device, _materials(scene)),
-            storage(device, _light_rows(lights, self._batches)),
+            *meshes,
+            *material_buffers(device, scene, textures),
+            light_buffer(device, lights, self._batches),
             self._views,
             self._shadows,
         ]
         assert len(resources) == _FIRST_PROBE_BINDING
         bindings = Bindings(device, [*resources, *probe_textures(device, volumes)])
+        holes = textures is not None and len(textures.alpha_mode) > 0
         vertex_head = "#version 450\n" + shader_text("verification/scene.glsl")
         shadow = compile_glsl(vertex_head + shader_text("verification/shadow.vert"), "vert", "shadow.vert")
+        cut = compile_glsl(_fragment_shader("shadow.frag", "textures.glsl"), "frag", "shadow.frag") if holes else None
         vertex = compile_glsl(vertex_head + shader_text("verification/picture.vert"), "vert", "picture.vert")
-        fragment = compile_glsl(picture_fragment_shader(volumes, scene.origin), "frag", "picture.frag")
-        self._shadow_program = graphics_pipeline(device, shadow, None, bindings, 0)
+        fragment = compile_glsl(picture_fragment_shader(volumes, scene.origin, holes=holes), "frag", "picture.frag")
+        self._shadow_program = graphics_pipeline(device, shadow, cut, bindings, 0)
         self._program = graphics_pipeline(device, vertex, fragment, bindings, 3)
         self._targets: dict[tuple[int, int], _Targets] = {}
 
@@ -101,7 +106,7 @@ class Rasterizer:
             self._draw_shadows(batch, receivers)
             for i in range(samples):
                 shift = ((i + 0.5) / samples - 0.5, _radical_inverse(i) + 0.5 / samples - 0.5)
-                self._draw(lens, targets, shift, (batch.first, batch.last))
+                self._draw(lens, targets, shift, (batch.first, batch.last, i))
                 # Later batches add direct light only: the rest is the same each time.
                 for k in range(3 if n == 0 else 1):
                     sums[k] += targets.download[k].read(np.float32, (height, width, 4))
@@ -122,7 +127,7 @@ class Rasterizer:
             return _empty(self._environment, width, height), np.full((height, width, 3), np.nan)
         targets = self._targets_of(width, height)
         lens = _Lens.make(camera, self._origin, NEAR * self._diagonal, width, height)
-        self._draw(lens, targets, (0.0, 0.0), (0, 0))
+        self._draw(lens, targets, (0.0, 0.0), (0, 0, 0))
         direct, indirect, emission = (b.read(np.float32, (height, width, 4)) for b in targets.download)
         picture = Picture(direct[..., :3], indirect[..., :3], emission[..., :3], emission[..., 3])
         return picture, self._points(lens, targets, 0.0) + self._origin
@@ -146,7 +151,7 @@ class Rasterizer:
         found = []
         # Opposite corners of the pixels: towards a horizon, half a pixel is a long way.
         for shift in (-0.5, 0.5):
-            self._draw(lens, targets, (shift, shift), (0, 0))
+            self._draw(lens, targets, (shift, shift), (0, 0, 0))
             points = self._points(lens, targets, shift)
             found.append(points[np.isfinite(points[..., 0])])
         seen = np.concatenate(found)
@@ -161,12 +166,14 @@ class Rasterizer:
 
         def record(commands: Commands) -> None:
             for layer, matrix in enumerate(matrices):
-                commands.draw(self._shadow_program, self._draws, _push(matrix), depth=self._shadows, layer=layer)
+                push = _push(matrix, [0, 0, 0, self._flags])
+                commands.draw(self._shadow_program, self._draws, push, depth=self._shadows, layer=layer)
 
         self._device.run(record)
 
-    def _draw(self, lens: _Lens, targets: _Targets, shift: tuple[float, float], lights: tuple[int, int]) -> None:
-        push = _push(lens.projection(*shift), [*lens.eye, self._flags], lights)
+    def _draw(self, lens: _Lens, targets: _Targets, shift: tuple[float, float], numbers: tuple[int, int, int]) -> None:
+        """One frame, with the lights [first, last); its number is the third."""
+        push = _push(lens.projection(*shift), [*lens.eye, self._flags], numbers, 2 * lens.tangents[1] / lens.height)
         r, g, b = (float(x) for x in self._environment)
 
         def record(commands: Commands) -> None:
@@ -178,43 +185,25 @@ class Rasterizer:
         self._device.run(record)
 
 
-def check_drawable(scene: Scene) -> None:
-    """Refuse a scene that the shaders would draw as something else: they know even, opaque Lambert surfaces, with emission.
+def picture_fragment_shader(volumes: Sequence[VolumeData], frame: ArrayLike, *, holes: bool) -> str:
+    """The verification's fragment shader for a bundle: scene, probes, the reference module, and what uses them.
 
-    Raises
-    ------
-    SceneError
-        ``verification.unsupported``, naming a material in use and what of it is not drawn.
+    Parameters
+    ----------
+    volumes : sequence of VolumeData
+    frame : (3,) float
+        World position of the zero of the shader's frame, metres.
+    holes : bool
+        Whether any surface is cut out or blended: to ask costs every scene's hidden surfaces their early depth test.
     """
-    m = scene.materials
-    unknown = {
-        "unlit": m.unlit,
-        "alphaMode MASK": m.alpha_mode == ALPHA_MASK,
-        "alphaMode BLEND": m.alpha_mode == ALPHA_BLEND,
-        "baseColorTexture": m.base_color_texture != NO_TEXTURE,
-        "metallicRoughnessTexture": m.metallic_roughness_texture != NO_TEXTURE,
-        "emissiveTexture": m.emissive_texture != NO_TEXTURE,
-        "metallicFactor other than 0 or roughnessFactor other than 1": ~m.lambert,
-    }
-    for i in np.unique(scene.triangle_material):
-        features = [feature for feature, has in unknown.items() if has[i]]
-        if features:
-            raise SceneError(
-                "verification.unsupported",
-                f"has {', '.join(features)}, which verification does not draw yet; the bundle itself is not affected",
-                f"material {m.name[i]!r}",
-            )
+    probes = probe_module(volumes, _FIRST_PROBE_BINDING, frame)
+    head = "#define HOLES\n" if holes else ""
+    return _fragment_shader("picture.frag", "textures.glsl", "gloss.glsl", "lights.glsl", before=head, after=probes)
 
 
-def picture_fragment_shader(volumes: Sequence[VolumeData], frame: ArrayLike) -> str:
-    """The verification's fragment shader for a bundle: scene, probes, the reference module, and what uses them."""
-    parts = (
-        "#version 450",
-        shader_text("verification/scene.glsl"),
-        probe_module(volumes, _FIRST_PROBE_BINDING, frame),
-        shader_text("verification/picture.frag"),
-    )
-    return "\n".join(parts)
+def _fragment_shader(name: str, *parts: str, before: str = "", after: str = "") -> str:
+    pieces = [shader_text(f"verification/{part}") for part in ("scene.glsl", *parts)]
+    return "\n".join(("#version 450", before, *pieces, after, shader_text(f"verification/{name}")))
 
 
 @dataclass(frozen=True)
@@ -274,54 +263,10 @@ def _empty(environment: F64, width: int, height: int) -> Picture:
     return Picture(nothing, nothing, np.broadcast_to(environment.astype(np.float32), nothing.shape).copy(), nothing[..., 0])
 
 
-def _draws(scene: Scene) -> tuple[list[Draw], F32]:
-    """One draw a mesh, and the transforms of all instances in the draws' order, (n, 3, 4)."""
-    first = scene.mesh_first_triangle
-    draws, transforms = [], [np.eye(3, 4)[None]]
-    if first[1] > first[0]:
-        draws.append(Draw(3 * int(first[1] - first[0]), 1, 3 * int(first[0]), 0))
-    used = 1
-    for mesh in range(1, len(first) - 1):
-        of_mesh = np.flatnonzero(scene.instance_mesh == mesh)
-        if of_mesh.size and first[mesh + 1] > first[mesh]:
-            draws.append(Draw(3 * int(first[mesh + 1] - first[mesh]), len(of_mesh), 3 * int(first[mesh]), used))
-            transforms.append(scene.instance_transform[of_mesh])
-            used += len(of_mesh)
-    return draws, np.concatenate(transforms).astype(np.float32)
-
-
-def _triangles(scene: Scene) -> F32:
-    """Front normal in the mesh's own space (zero where a triangle has no area) and material index, (t, 4)."""
-    v = scene.positions[scene.indices].astype(np.float64)
-    normal = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-    return np.concatenate([normal, scene.triangle_material[:, None]], 1).astype(np.float32)
-
-
-def _materials(scene: Scene) -> F32:
-    """Base colour and 1 if double-sided; emission and 0, (m, 2, 4)."""
-    m = scene.materials
-    rows = np.zeros((len(m.name), 2, 4), np.float32)
-    rows[:, 0, :3], rows[:, 0, 3], rows[:, 1, :3] = m.base_color, m.double_sided, m.emission
-    return rows
-
-
-def _light_rows(lights: Lights, groups: Sequence[Batch]) -> F32:
-    """As picture.frag's ``arriving`` reads them, (n, 4, 4)."""
-    rows = np.zeros((len(lights.kind), 4, 4), np.float32)
-    rows[:, 0, :3], rows[:, 0, 3] = lights.position, lights.kind
-    rows[:, 1, :3], rows[:, 1, 3] = lights.direction, lights.range
-    rows[:, 2, :3] = lights.value
-    rows[:, 3, :2] = cone_ramps(lights)
-    for batch in groups:
-        rows[batch.first : batch.last, 2, 3] = batch.first_view
-        rows[batch.first : batch.last, 3, 2] = batch.view_count
-    return rows
-
-
-def _push(matrix: F64, camera: Sequence[float] = (0, 0, 0, 0), lights: tuple[int, int] = (0, 0)) -> bytes:
-    return matrix.T.astype(np.float32).tobytes() + np.array(camera, np.float32).tobytes() + np.array([*lights, 0, 0], np.int32).tobytes()
+def _push(matrix: F64, camera: Sequence[float], numbers: tuple[int, int, int] = (0, 0, 0), pixel: float = 0.0) -> bytes:
+    """scene.glsl's ``Push``."""
+    floats, integers = np.array([*camera, pixel, 0, 0, 0], np.float32), np.array([*numbers, 0], np.int32)
+    return matrix.T.astype(np.float32).tobytes() + floats[:4].tobytes() + integers.tobytes() + floats[4:].tobytes()
 
 
 def _radical_inverse(i: int) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bake_core.scene import Scene
+from bake_core.scene import NO_TEXTURE, Scene
 from bake_core.spec import OUTPUTS, OutputName, Spec
 
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
@@ -48,10 +48,11 @@ def select(scene: Scene, spec: Spec) -> Selection:
     """Choose outputs: what the spec demands, or what the scene's materials can make use of."""
     used = np.unique(scene.triangle_material)
     m = scene.materials
-    glossy = not bool(m.lambert[used].all())
+    # A metal of roughness 1 reflects as broadly as a matt surface does: its light is looked up in irradiance maps, too.
+    glossy = bool(((m.roughness < 1) | (m.metallic_roughness_texture != NO_TEXTURE))[used].any())
     if spec.outputs == "auto":
         kept: tuple[OutputName, ...] = OUTPUTS if glossy else ("irradiance", "visibility")
-        why = "no material is glossy, so nothing reflects single directions"
+        why = "no material is glossy (roughness below 1), so nothing reflects single directions"
     else:
         kept = tuple(o for o in OUTPUTS if o in spec.outputs)
         why = "not in the spec's outputs"

@@ -24,9 +24,9 @@ from bake_core.errors import BundleError, InputError
 from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
-from bake_core.raster import Rasterizer, check_drawable
+from bake_core.raster import Rasterizer
 from bake_core.scene import Camera, Scene
-from bake_core.spec import ConstantEnvironment, Spec, parse_spec
+from bake_core.spec import Spec, parse_spec
 from bake_core.thresholds import Thresholds
 from bake_core.transport import Tracer
 from bake_core.verification_report import PARTS, page, write_pictures
@@ -88,9 +88,7 @@ def verify(
     BundleError
         ``bundle.other_scene``, ``bundle.no_irradiance``.
     InputError
-        ``verification.invalid``, ``verification.in_the_way``; ``verification.unsupported`` for an environment that is not drawn yet.
-    SceneError
-        ``verification.unsupported``, naming a material that is not drawn yet.
+        ``verification.invalid``, ``verification.in_the_way``; as :func:`bake_core.environment.read_environment` for an image of the sky.
     MachineError
         ``vulkan.*`` where this machine cannot rasterise.
     Cancelled
@@ -99,7 +97,6 @@ def verify(
     thresholds = thresholds or Thresholds()
     _check_request(width, height, samples, out)
     spec = _check_bundle(bundle, scene)
-    check_drawable(scene)
     tell = _Teller(progress)
     tell("building", 0.0)
     tracer = Tracer.build(scene, spec, read_environment(spec.environment, find)[0])
@@ -107,7 +104,7 @@ def verify(
     work.mkdir()
     try:
         with Device() as device:
-            rasterizer = Rasterizer(device, scene, tracer.lights, tracer.tables.environment, bundle.volumes)
+            rasterizer = Rasterizer(device, scene, tracer.lights, tracer.tables.environment, bundle.volumes, tracer.tables.textures)
             if not cameras:
                 cameras = scene.cameras or automatic_cameras(rasterizer, scene, bundle.volumes)
             entries = []
@@ -177,15 +174,7 @@ def _check_bundle(bundle: Bundle, scene: Scene) -> Spec:
         raise BundleError("bundle.other_scene", f"was baked from {digest}, this scene is {scene.digest}; give that scene", str(bundle.path))
     if not all("irradiance" in v.atlases for v in bundle.volumes):
         raise BundleError("bundle.no_irradiance", "holds no irradiance to light a picture with; bake it with that output", str(bundle.path))
-    spec = parse_spec(bundle.manifest["spec"], f"{bundle.path}: spec")
-    if not isinstance(spec.environment, ConstantEnvironment):
-        raise InputError(
-            "verification.unsupported",
-            f"the bundle was baked under an environment of kind {spec.environment.kind!r}, which verification does not draw yet; "
-            "the bundle itself is not affected",
-            f"{bundle.path}: spec: environment.kind",
-        )
-    return spec
+    return parse_spec(bundle.manifest["spec"], f"{bundle.path}: spec")
 
 
 def _file_names(cameras: Sequence[Camera]) -> list[str]:

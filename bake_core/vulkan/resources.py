@@ -15,7 +15,12 @@ if TYPE_CHECKING:
     from bake_core.vulkan.device import Device
 
 F32 = NDArray[np.float32]
-_FLOATS = {1: "VK_FORMAT_R32_SFLOAT", 2: "VK_FORMAT_R32G32_SFLOAT", 4: "VK_FORMAT_R32G32B32A32_SFLOAT"}
+_FORMATS = {
+    (np.float32, 1): "VK_FORMAT_R32_SFLOAT",
+    (np.float32, 2): "VK_FORMAT_R32G32_SFLOAT",
+    (np.float32, 4): "VK_FORMAT_R32G32B32A32_SFLOAT",
+    (np.uint16, 4): "VK_FORMAT_R16G16B16A16_UNORM",
+}
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Image:
 
     @property
     def bytes(self) -> int:
-        """Size of all texels, packed."""
+        """Size of all texels, packed; for those that are drawn into."""
         return self.width * self.height * self.layers * self.channels * 4
 
 
@@ -77,6 +82,10 @@ def storage(device: Device, data: NDArray[Any] | int) -> Buffer:
     most = vk.vkGetPhysicalDeviceProperties(device.physical).limits.maxStorageBufferRange
     if size > most:
         raise MachineError("vulkan.buffer_too_large", f"{size} bytes in one buffer are more than {device.name} takes ({most})")
+    return _buffer(device, size, raw)
+
+
+def _buffer(device: Device, size: int, raw: NDArray[np.uint8] | None) -> Buffer:
     usage = vk.VK_BUFFER_USAGE_STORAGE_BUFFER_BIT | vk.VK_BUFFER_USAGE_TRANSFER_SRC_BIT | vk.VK_BUFFER_USAGE_TRANSFER_DST_BIT
     info = vk.VkBufferCreateInfo(size=size, usage=usage, sharingMode=vk.VK_SHARING_MODE_EXCLUSIVE)
     handle = device.make(vk.vkCreateBuffer, vk.vkDestroyBuffer, info)
@@ -90,13 +99,22 @@ def storage(device: Device, data: NDArray[Any] | int) -> Buffer:
     return buffer
 
 
-def texture(device: Device, texels: F32, *, linear: bool) -> Image:
-    """A sampled texture of (layers, height, width, channels) float32, 1, 2 or 4 channels, clamped at its edges, without mip levels."""
+def texture(device: Device, texels: F32 | NDArray[np.uint16], *, linear: bool) -> Image:
+    """A sampled texture, clamped at its edges, without mip levels.
+
+    Parameters
+    ----------
+    texels : (layers, height, width, channels) float32 or uint16
+        1, 2 or 4 channels; uint16 has 4, and shaders see it in [0, 1].
+    linear : bool
+        Between texels; else the nearest.
+    """
     layers, height, width, channels = texels.shape
     usage = vk.VK_IMAGE_USAGE_SAMPLED_BIT | vk.VK_IMAGE_USAGE_TRANSFER_DST_BIT
-    kind = getattr(vk, _FLOATS[channels])
+    kind = getattr(vk, _FORMATS[texels.dtype.type, channels])
     image = _image(device, width, height, layers, channels, kind, usage, vk.VK_IMAGE_ASPECT_COLOR_BIT, linear=linear)
-    source = storage(device, texels)
+    # No shader reads it there, so it may be larger than a storage buffer.
+    source = _buffer(device, texels.nbytes, np.ascontiguousarray(texels).reshape(-1).view(np.uint8))
     device.run(lambda commands: commands.upload(source, image))
     return image
 
