@@ -122,7 +122,7 @@ def _gloss(t, base, metallic, roughness, dx, dy, dz, n):  # type: ignore[no-unty
     -------
     (6, 3, 1, 1, 1, 3, 3, 3, 1) float64
         Tangents, wo in their frame, its :func:`smith`, alpha, roughness, c₀, c₁, the diffuse factor without (1 - Es(i)), and the chance to
-        sample the specular part.
+        sample visible normals.
     """
     g = t.gloss
     roughness = max(roughness, MIN_ROUGHNESS)
@@ -140,12 +140,17 @@ def _gloss(t, base, metallic, roughness, dx, dy, dz, n):  # type: ignore[no-unty
     r0, r1 = _metal(red, lost, e_avg)
     g0, g1 = _metal(green, lost, e_avg)
     b0, b1 = _metal(blue, lost, e_avg)
+    # Single scattering alone: what the sampling of visible normals knows of.
+    f0 = red + green + blue
+    first = plain * 3 * outside + metallic * (f0 * e + (3 - f0) * b)
     flat, edge = plain * _DIELECTRIC, plain * (1 - _DIELECTRIC)
     c0 = (flat + metallic * r0, flat + metallic * g0, flat + metallic * b0)
     c1 = (edge + metallic * r1, edge + metallic * g1, edge + metallic * b1)
     specular = (c0[0] + c0[1] + c0[2]) * e + (c1[0] + c1[1] + c1[2]) * b
     diffuse = plain * (1 - outside) * (red + green + blue)
-    chance = specular / (specular + diffuse) if specular > 0 else 0.0
+    # What leaves after more bounces is spread like a matt surface's light, and so is sampled as that. By visible normals alone a white
+    # metal of roughness 1 loses 2 of 3 directions below its horizon, weighs the others by 3, and a path of ten bounces by 3^10.
+    chance = first / (specular + diffuse) if specular > 0 else 0.0
     return (
         (tx, ty, tz, bx, by, bz),
         (ox, oy, oz),

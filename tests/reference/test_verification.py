@@ -16,15 +16,16 @@ from bake_core.bake import bake
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.cameras import parse_cameras
 from bake_core.environment import no_images, read_environment
-from bake_core.errors import BundleError, Cancelled, InputError, SceneError
+from bake_core.errors import BundleError, Cancelled, InputError
 from bake_core.gltf.reader import load_scene
 from bake_core.images import read_exr
 from bake_core.irradiance import covered
 from bake_core.lights import merge_lights
 from bake_core.progress import Progress
-from bake_core.raster import Rasterizer, check_drawable
-from bake_core.scene import ALPHA_BLEND, ALPHA_MASK, Scene
+from bake_core.raster import Rasterizer
+from bake_core.scene import Scene
 from bake_core.spec import load_spec, parse_spec
+from bake_core.textures import texture_table
 from bake_core.thresholds import Thresholds, load_thresholds
 from bake_core.verification import verify
 from bake_core.vulkan import Device
@@ -130,46 +131,6 @@ def test_a_bundle_of_another_scene_or_without_irradiance_is_refused(bundle: Bund
     assert caught.value.slug == "bundle.no_irradiance"
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "feature"),
-    [
-        ("unlit", True, "unlit"),
-        ("alpha_mode", ALPHA_MASK, "alphaMode MASK"),
-        ("alpha_mode", ALPHA_BLEND, "alphaMode BLEND"),
-        ("base_color_texture", 0, "baseColorTexture"),
-        ("metallic_roughness_texture", 0, "metallicRoughnessTexture"),
-        ("emissive_texture", 0, "emissiveTexture"),
-        ("metallic", 0.5, "metallicFactor"),
-        ("roughness", 0.5, "roughnessFactor"),
-    ],
-)
-def test_what_the_rasteriser_cannot_draw_is_refused_by_name(
-    bundle: Bundle, scene: Scene, tmp_path: Path, column: str, value: Any, feature: str
-) -> None:
-    """Were a material only there, and not in use, it would not matter."""
-    values = getattr(scene.materials, column).copy()
-    used = int(scene.triangle_material[0])
-    values[used] = value
-    changed = replace(scene, materials=replace(scene.materials, **{column: values}))
-    with pytest.raises(SceneError) as caught:
-        verify(bundle, changed, None, tmp_path / "out", **TINY)
-    assert caught.value.slug == "verification.unsupported"
-    assert feature in caught.value.message
-    assert caught.value.where == f"material {scene.materials.name[used]!r}"
-    assert list(tmp_path.iterdir()) == []
-    other = (used + 1) % len(scene.materials.name)
-    check_drawable(replace(changed, triangle_material=np.full_like(scene.triangle_material, other)))
-
-
-def test_an_environment_that_is_an_image_is_refused(bundle: Bundle, scene: Scene, tmp_path: Path) -> None:
-    spec = bundle.manifest["spec"] | {"environment": {"kind": "equirect", "image": f"sha256:{'0' * 64}"}}
-    with pytest.raises(InputError) as caught:
-        verify(replace(bundle, manifest=bundle.manifest | {"spec": spec}), scene, None, tmp_path / "out", **TINY)
-    assert caught.value.slug == "verification.unsupported"
-    assert "environment" in caught.value.where
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_cancelling_leaves_nothing_behind(bundle: Bundle, scene: Scene, tmp_path: Path) -> None:
     flag = np.zeros(1, np.uint8)
 
@@ -186,7 +147,7 @@ def test_automatic_cameras_stand_inside_and_see_something(bundle: Bundle, scene:
     spec = parse_spec(bundle.manifest["spec"])
     with Device() as device:
         environment = read_environment(spec.environment, no_images)[0]
-        rasterizer = Rasterizer(device, scene, merge_lights(scene, spec), environment.constant, bundle.volumes)
+        rasterizer = Rasterizer(device, scene, merge_lights(scene, spec), environment.constant, bundle.volumes, texture_table(scene))
         cameras, again = (automatic_cameras(rasterizer, scene, bundle.volumes) for _ in range(2))
         assert 1 < len(cameras) <= 3
         assert len({c.name for c in cameras}) == len(cameras)
