@@ -77,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.out / 'index.html'}: {'passed' if report['passed'] else 'failed'}, {report['seconds']:.1f} s")
     for failure in report["failures"]:
         print(f"octobake: {failure}", file=sys.stderr)
+    if report["failures"] and thresholds is None:
+        print("octobake: these limits are the Cornell box's; a scene states its own with --thresholds FILE", file=sys.stderr)
     return 0 if report["passed"] else 5
 
 
