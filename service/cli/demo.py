@@ -94,17 +94,17 @@ def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds
         ("verification", f"{duration(report['seconds'])} on {report['device']}"),
         ("everything", duration(seconds)),
     ]
-    limits: list[tuple[str, ...]] = [("camera", "part", "figure", "measured", "threshold", "verdict")]
-    for camera in report["cameras"]:
-        for part, wanted in report["thresholds"].items():
-            for figure, limit in wanted.items():
-                if limit is not None:
-                    measured = camera[part][figure]
-                    low, high = limit if isinstance(limit, list) else (None, limit)
-                    kept = measured is not None and measured <= high and (low is None or measured >= low)
-                    shown = "none" if measured is None else f"{measured:.4f}"
-                    wish = f"≤ {high:g}" if low is None else f"{low:g} to {high:g}"
-                    limits.append((camera["name"], part, figure, shown, wish, "pass" if kept else "FAIL"))
+    limits: list[tuple[str, ...]] = [("where", "part", "figure", "measured", "threshold", "verdict")]
+    parts = [(camera["name"], part, camera[part]) for camera in report["cameras"] for part in ("indirect", "whole")]
+    for name, part, figures in [*parts, ("surfaces", "receivers", report["receivers"])]:
+        for figure, limit in report["thresholds"][part].items():
+            if limit is not None:
+                measured = figures[figure]
+                low, high = limit if isinstance(limit, list) else (None, limit)
+                kept = measured is not None and measured <= high and (low is None or measured >= low)
+                shown = "none" if measured is None else f"{measured:.4f}"
+                wish = f"≤ {high:g}" if low is None else f"{low:g} to {high:g}"
+                limits.append((name, part, figure, shown, wish, "pass" if kept else "FAIL"))
     return f"\n{_columns(rows)}\n\n{_columns(limits)}"
 
 
