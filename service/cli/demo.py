@@ -82,8 +82,10 @@ def _service(out: Path) -> Iterator[str]:
 
 def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds: float) -> str:
     """Probes, samples, error, seconds; then each threshold with what was measured."""
+    from bake_core.verification_report import PARTS, number
     from service.cli.progress import duration, percent
 
+    receivers, named = report["receivers"], {"mean ratio": "mean_ratio", "relMSE": "relmse", "95th percentile": "p95"}
     with zipfile.ZipFile(bundle) as archive:
         manifest = json.loads(archive.read("manifest.json"))
     rows: list[tuple[str, ...]] = [
@@ -91,12 +93,12 @@ def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds
         ("samples", str(result["samples"])),
         ("error", "unknown" if result["error"] is None else percent(result["error"])),
         ("bake", duration(result["seconds"])),
+        (f"{receivers['count']} surface points", ", ".join(f"{name} {number(receivers[key])}" for name, key in named.items())),
         ("verification", f"{duration(report['seconds'])} on {report['device']}"),
         ("everything", duration(seconds)),
     ]
-    limits: list[tuple[str, ...]] = [("where", "part", "figure", "measured", "threshold", "verdict")]
-    parts = [(camera["name"], part, camera[part]) for camera in report["cameras"] for part in ("indirect", "whole")]
-    for name, part, figures in [*parts, ("surfaces", "receivers", report["receivers"])]:
+    limits: list[tuple[str, ...]] = [("camera", "part", "figure", "measured", "threshold", "verdict")]
+    for name, part, figures in [(camera["name"], part, camera[part]) for camera in report["cameras"] for part in PARTS]:
         for figure, limit in report["thresholds"][part].items():
             if limit is not None:
                 measured = figures[figure]

@@ -28,7 +28,9 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--out", metavar="DIR", type=Path, required=True, help="pictures, verification.json and index.html go here")
     parser.add_argument("--width", type=positive, default=640, help="pixels; default 640")
     parser.add_argument("--height", type=positive, default=360, help="pixels; default 360")
-    parser.add_argument("--samples", type=positive, default=128, help="paths a pixel of the reference; default 128")
+    parser.add_argument(
+        "--samples", type=positive, default=128, help="paths a pixel of the reference, 16 times as many from surface points; default 128"
+    )
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
     parser.add_argument("--json", action="store_true", help="print the report as one JSON document")
     parser.set_defaults(run=run)
