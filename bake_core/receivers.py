@@ -132,7 +132,7 @@ def draw_receivers(
     Cancelled
     """
     flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
-    sampler = SurfaceSampler(scene, tracer, volume_boxes(volumes) if boxes is None else boxes, seed)
+    sampler = SurfaceSampler(scene, tracer, volume_boxes(volumes) if boxes is None else boxes, seed, flag)
     probes = _probe_table(volumes, scene.origin)
     # An empty first part, so that there is always something to join.
     parts = [_inspected(tracer, sampler.draw(0, 0), probes, seed, flag)]

@@ -13,6 +13,7 @@ import numpy as np
 from numba import uint32, uint64
 from numpy.typing import ArrayLike, NDArray
 
+from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.sampling import mix64, random_pair, reverse_bits, sobol_pair, uniform_triangle
 from bake_core.scene import Scene
@@ -61,20 +62,27 @@ class SurfaceSampler:
         Lowest and highest corners, world, metres. Where they overlap, no place counts twice.
     seed : int
         Places are a function of it and of their index.
+    cancelled : (1,) uint8, optional
 
     Attributes
     ----------
     area : float
         m² inside the boxes, both sides of double-sided surfaces; holes, and overlaps of boxes as often as they overlap, included.
+
+    Raises
+    ------
+    Cancelled
     """
 
-    def __init__(self, scene: Scene, tracer: Tracer, boxes: ArrayLike, seed: int) -> None:
+    def __init__(self, scene: Scene, tracer: Tracer, boxes: ArrayLike, seed: int, cancelled: NDArray[np.uint8] | None = None) -> None:
         self._tables: Tables = tracer.tables
         self._counts = np.diff(scene.mesh_first_triangle)[np.concatenate([[0], scene.instance_mesh]).astype(np.int64)]
         self._boxes = np.ascontiguousarray(np.asarray(boxes, np.float64).reshape(-1, 2, 3) - scene.origin)
         self._seed = seed
         self._areas = np.zeros((len(self._boxes), len(self._counts)))
-        _sum_areas(self._tables, self._counts, self._boxes, *_scratch(), self._areas)
+        flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
+        if not _sum_areas(self._tables, self._counts, self._boxes, *_scratch(), flag, self._areas):
+            raise Cancelled
         self.area = float(self._areas.sum())
 
     def draw(self, first: int, count: int) -> Places:
@@ -187,15 +195,18 @@ def _area_inside(t, item, triangle, box, corners, polygon):  # type: ignore[no-u
 
 
 @entry_kernel
-def _sum_areas(t, counts, boxes, corners, polygon, areas):  # type: ignore[no-untyped-def]
-    """Area inside each box by item, (b, items) float64."""
+def _sum_areas(t, counts, boxes, corners, polygon, cancelled, areas):  # type: ignore[no-untyped-def]
+    """Area inside each box by item, (b, items) float64; whether it came to the end."""
     for b in range(boxes.shape[0]):
         for item in range(counts.shape[0]):
+            if cancelled[0]:
+                return False
             total = 0.0
             for triangle in range(counts[item]):
                 area, _ = _area_inside(t, item, triangle, boxes[b], corners, polygon)
                 total += area
             areas[b, item] = total
+    return True
 
 
 @entry_kernel
