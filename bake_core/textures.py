@@ -331,10 +331,17 @@ def _has_holes(t):  # type: ignore[no-untyped-def]
 has_holes = either("textures")(_has_holes)(lambda t: False)
 
 
+@kernel
+def _opacity_or_all(t, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
+    return _opacity(t.textures, material, triangle, b1, b2) if t.textures.alpha_mode.shape[0] else 1.0
+
+
+# How much of a point of a triangle is there (t, material, triangle, b1, b2): 0 or 1 where it is masked, in between where it is blended.
+opacity = either("textures")(_opacity_or_all)(lambda t, material, triangle, b1, b2: 1.0)
+
+
 def _lets_through(t, material, triangle, b1, b2, ray_bits):  # type: ignore[no-untyped-def]
-    if t.textures.alpha_mode.shape[0] == 0:
-        return False
-    there = _opacity(t.textures, material, triangle, b1, b2)
+    there = _opacity_or_all(t, material, triangle, b1, b2)
     if there >= 1:
         return False
     if there <= 0:
@@ -383,7 +390,7 @@ emission_at = either("textures")(_emission)(_even_emission)
 
 def _emission_through_holes(t, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
     r, g, b = _emission(t, material, triangle, b1, b2, 0.0)
-    there = _opacity(t.textures, material, triangle, b1, b2) if t.textures.alpha_mode.shape[0] else 1.0
+    there = _opacity_or_all(t, material, triangle, b1, b2)
     return there * r, there * g, there * b
 
 
@@ -453,7 +460,7 @@ def _mean_emission(t, triangles, out):  # type: ignore[no-untyped-def]
             for column in range(n):
                 b1, b2 = uniform_triangle((row + 0.5) / n, (column + 0.5) / n)
                 r, g, b = _emission(t, material, triangle, b1, b2, 1.0 / (n * n))
-                there = _opacity(t.textures, material, triangle, b1, b2) if t.textures.alpha_mode.shape[0] else 1.0
+                there = _opacity_or_all(t, material, triangle, b1, b2)
                 total += there * (r + g + b)
         out[triangle] = total / (n * n)
 

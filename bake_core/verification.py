@@ -25,6 +25,7 @@ from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
 from bake_core.raster import Rasterizer
+from bake_core.receiver_comparison import compare_receivers, measure_receivers
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
 from bake_core.thresholds import Thresholds
@@ -33,11 +34,14 @@ from bake_core.verification_report import PARTS, page, write_pictures
 from bake_core.vulkan import Device
 
 REPORT = "verification.json"
+RECEIVERS = "receivers.json"
 # Defaults of every way to ask for a verification: the reference's noise is kept out of the figures, so these are for eyes.
 WIDTH, HEIGHT, SAMPLES = 640, 360, 128
 LARGEST_SIDE, MOST_SAMPLES = 8192, 1 << 20
 # The two halves of the reference.
 _SEEDS = (0x0C70BA4E, 0x0C70BA4F)
+# From each receiver, for one a pixel: 2,048 receivers take a seventh of what the default picture does, and their noise stays out of sight.
+_PATHS_PER_SAMPLE = 16
 # Along each side of a pixel that shows sky.
 _SKY_POINTS = 4
 
@@ -63,14 +67,15 @@ def verify(
     2. Choose cameras: those given, else the glTF's own, else automatic ones.
     3. For each camera, rasterise on Vulkan with the bundle's probes, and path-trace two halves of the reference.
     4. Compare the indirect part and the whole, hold the figures against the thresholds.
-    5. Write everything into a folder beside `out`, and put that in its place.
+    5. Do the same with the bundle's irradiance at thousands of surface points.
+    6. Write everything into a folder beside `out`, and put that in its place.
 
     Parameters
     ----------
     out : Path
         A folder. One that exists is replaced only if it holds a verification or nothing.
     samples : int
-        Paths a pixel of the reference, both halves together; even.
+        Paths a pixel of the reference, both halves together; even. Sixteen times as many from each surface point.
     thresholds : Thresholds, optional
         Default: those of :class:`Thresholds`.
     find : callable, optional
@@ -108,21 +113,24 @@ def verify(
             if not cameras:
                 cameras = scene.cameras or automatic_cameras(rasterizer, scene, bundle.volumes)
             entries = []
+            parts = len(cameras) + 1
             for i, (camera, name) in enumerate(zip(cameras, _file_names(cameras), strict=True)):
                 begun = time.perf_counter()
                 raster = rasterizer.render(camera, width, height)
                 if tracer.tables.sky is not None:
                     raster = _before(raster, tracer.tables.sky, camera)
                 rastered = time.perf_counter()
-                halves = _halves(tracer, camera, width, height, samples, spec, threads, tell.part(i, len(cameras)), cancelled)
+                halves = _halves(tracer, camera, width, height, samples, spec, threads, tell.part(i, parts), cancelled)
                 seconds = {"raster": rastered - begun, "path": time.perf_counter() - rastered}
                 inside = _inside(rasterizer, bundle, camera, width, height)
                 entries.append(_entry(work, camera, name, raster, halves, inside, thresholds, seconds))
             name = device.name
+        receivers = _receivers(work, bundle, scene, tracer, samples, thresholds, threads, tell.part(len(cameras), parts), cancelled)
         tell("writing", 1.0)
         report: dict[str, Any] = {
-            "passed": not any(e["failures"] for e in entries),
-            "failures": [f"{e['name']}: {failure}" for e in entries for failure in e["failures"]],
+            "passed": not any(e["failures"] for e in [*entries, receivers]),
+            "failures": [f"{e['name']}: {failure}" for e in entries for failure in e["failures"]]
+            + [f"receivers: {failure}" for failure in receivers["failures"]],
             "scene": scene.digest,
             "bundle": content_digest(dump_json(bundle.manifest)),
             "width": width,
@@ -131,6 +139,7 @@ def verify(
             "device": name,
             "thresholds": thresholds.model_dump(mode="json"),
             "cameras": entries,
+            "receivers": receivers,
             "seconds": time.perf_counter() - started,
         }
         (work / REPORT).write_bytes(dump_json(report))
@@ -256,6 +265,44 @@ def _entry(
         "failures": thresholds.failures(figures),
         "files": files,
         "seconds": seconds,
+    }
+
+
+def _receivers(
+    work: Path,
+    bundle: Bundle,
+    scene: Scene,
+    tracer: Tracer,
+    samples: int,
+    thresholds: Thresholds,
+    threads: int,
+    progress: ProgressCallback,
+    cancelled: NDArray[np.uint8] | None,
+) -> dict[str, Any]:
+    """The report's part on irradiance at surface points; writes the points."""
+    begun = time.perf_counter()
+    paths = _PATHS_PER_SAMPLE * samples
+    done = 0.0
+
+    def advance(share: float) -> None:
+        nonlocal done
+        done += share
+        progress(Progress("tracing", min(done, 1.0), samples))
+
+    receivers, answers, estimates = measure_receivers(
+        scene, tracer, bundle.volumes, samples=paths, threads=threads, advance=advance, cancelled=cancelled
+    )
+    figures = compare_receivers(answers, estimates)
+    columns = {"position": receivers.positions, "normal": receivers.normals, "irradiance": answers, "reference": estimates.mean(0)}
+    rows = [{key: column[i].tolist() for key, column in columns.items()} for i in range(len(receivers))]
+    (work / RECEIVERS).write_bytes(dump_json(rows))
+    return {
+        "count": len(receivers),
+        "left_out": {"behind": receivers.behind, "unseen": receivers.unseen},
+        "samples": paths,
+        **asdict(figures),
+        "failures": thresholds.receivers.failures(figures),
+        "seconds": time.perf_counter() - begun,
     }
 
 

@@ -86,6 +86,7 @@ def page(report: dict[str, Any]) -> str:
             f"<table><tr><th></th><th>mean ratio</th><th>relMSE</th><th>HDR-FLIP</th></tr>{rows}</table>"
             f"<ul class=bad>{failures}</ul><div class=row>{pictures}</div>"
         )
+    blocks.append(_receivers(report["receivers"]))
     facts = f"{report['width']} × {report['height']}, {report['samples']} paths a pixel, {html.escape(report['device'])}"
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
@@ -95,6 +96,31 @@ def page(report: dict[str, Any]) -> str:
         "figcaption{color:#555;padding:.2rem 0 .6rem}.bad{color:#b2182b}</style>"
         f"<h1>Verification {verdict}</h1><p>{facts}. In difference pictures red is too bright and blue too dark; full colour is "
         f"{FULL_DIFFERENCE:.0%} of the reference.</p>{''.join(blocks)}</html>\n"
+    )
+
+
+def _receivers(figures: dict[str, Any]) -> str:
+    """The block on irradiance at surface points."""
+    columns = (("mean ratio", "mean_ratio"), ("relMSE", "relmse"), ("95th percentile", "p95"))
+    failures = "".join(f"<li>{html.escape(f)}</li>" for f in figures["failures"])
+    return (
+        f"<h2>Irradiance at {figures['count']} surface points</h2><table><tr><th></th>"
+        + "".join(f"<th>{title}</th>" for title, _ in columns)
+        + "</tr><tr><th>receivers</th>"
+        + "".join(f"<td>{number(figures[key])}</td>" for _, key in columns)
+        + f"</tr></table><ul class=bad>{failures}</ul><p>{html.escape(receiver_facts(figures))}.</p>"
+    )
+
+
+def receiver_facts(figures: dict[str, Any]) -> str:
+    """How the receivers were come by, and how well their reference is known, in a line."""
+    if not figures["count"]:
+        return "no surface that can be seen lies within half a spacing of the volumes"
+    left_out = figures["left_out"]
+    return (
+        f"{figures['count']} receivers, {figures['samples']} paths from each; left out: {left_out['behind']} behind surfaces, "
+        f"{left_out['unseen']} seen by no probe; noise of the reference: relMSE {number(figures['reference_noise'])}, "
+        f"95th percentile {number(figures['reference_p95'])}"
     )
 
 

@@ -185,7 +185,9 @@ class VerificationRequest(_Request):
     thresholds: ThresholdsDocument | None = Field(None, description="Default: those of a Cornell box seen from inside.")
     width: int = Field(WIDTH, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
     height: int = Field(HEIGHT, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
-    samples: int = Field(SAMPLES, ge=2, le=MOST_SAMPLES, multiple_of=2, description="Paths a pixel of the path-traced twin.")
+    samples: int = Field(
+        SAMPLES, ge=2, le=MOST_SAMPLES, multiple_of=2, description="Paths a pixel of the twin; 16 times as many from each surface point."
+    )
     labels: Labels = {}
     priority: Priority = 0
 

@@ -82,8 +82,10 @@ def _service(out: Path) -> Iterator[str]:
 
 def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds: float) -> str:
     """Probes, samples, error, seconds; then each threshold with what was measured."""
+    from bake_core.verification_report import PARTS, number
     from service.cli.progress import duration, percent
 
+    receivers, named = report["receivers"], {"mean ratio": "mean_ratio", "relMSE": "relmse", "95th percentile": "p95"}
     with zipfile.ZipFile(bundle) as archive:
         manifest = json.loads(archive.read("manifest.json"))
     rows: list[tuple[str, ...]] = [
@@ -91,20 +93,20 @@ def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds
         ("samples", str(result["samples"])),
         ("error", "unknown" if result["error"] is None else percent(result["error"])),
         ("bake", duration(result["seconds"])),
+        (f"{receivers['count']} surface points", ", ".join(f"{name} {number(receivers[key])}" for name, key in named.items())),
         ("verification", f"{duration(report['seconds'])} on {report['device']}"),
         ("everything", duration(seconds)),
     ]
     limits: list[tuple[str, ...]] = [("camera", "part", "figure", "measured", "threshold", "verdict")]
-    for camera in report["cameras"]:
-        for part, wanted in report["thresholds"].items():
-            for figure, limit in wanted.items():
-                if limit is not None:
-                    measured = camera[part][figure]
-                    low, high = limit if isinstance(limit, list) else (None, limit)
-                    kept = measured is not None and measured <= high and (low is None or measured >= low)
-                    shown = "none" if measured is None else f"{measured:.4f}"
-                    wish = f"≤ {high:g}" if low is None else f"{low:g} to {high:g}"
-                    limits.append((camera["name"], part, figure, shown, wish, "pass" if kept else "FAIL"))
+    for name, part, figures in [(camera["name"], part, camera[part]) for camera in report["cameras"] for part in PARTS]:
+        for figure, limit in report["thresholds"][part].items():
+            if limit is not None:
+                measured = figures[figure]
+                low, high = limit if isinstance(limit, list) else (None, limit)
+                kept = measured is not None and measured <= high and (low is None or measured >= low)
+                shown = "none" if measured is None else f"{measured:.4f}"
+                wish = f"≤ {high:g}" if low is None else f"{low:g} to {high:g}"
+                limits.append((name, part, figure, shown, wish, "pass" if kept else "FAIL"))
     return f"\n{_columns(rows)}\n\n{_columns(limits)}"
 
 

@@ -28,7 +28,9 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--out", metavar="DIR", type=Path, required=True, help="pictures, verification.json and index.html go here")
     parser.add_argument("--width", type=positive, default=640, help="pixels; default 640")
     parser.add_argument("--height", type=positive, default=360, help="pixels; default 360")
-    parser.add_argument("--samples", type=positive, default=128, help="paths a pixel of the reference; default 128")
+    parser.add_argument(
+        "--samples", type=positive, default=128, help="paths a pixel of the reference, 16 times as many from surface points; default 128"
+    )
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
     parser.add_argument("--json", action="store_true", help="print the report as one JSON document")
     parser.set_defaults(run=run)
@@ -44,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from bake_core.scene_files import load_scene
     from bake_core.thresholds import load_thresholds
     from bake_core.verification import verify
+    from bake_core.verification_report import receiver_facts
     from service.cli.progress import ProgressLine
 
     cameras = load_cameras(args.camera) if args.camera else None
@@ -74,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(report, indent=2))
     else:
         print(table(report))
+        print(receiver_facts(report["receivers"]))
         print(f"{args.out / 'index.html'}: {'passed' if report['passed'] else 'failed'}, {report['seconds']:.1f} s")
     for failure in report["failures"]:
         print(f"octobake: {failure}", file=sys.stderr)
@@ -83,13 +87,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(report: dict[str, Any]) -> str:
-    """A line for each camera and part: mean ratio, relMSE and HDR-FLIP."""
+    """A line for each camera and part, and one for the receivers: mean ratio, relMSE, and HDR-FLIP or the 95th percentile."""
     from bake_core.verification_report import PARTS, number
 
-    rows = [("camera", "part", "mean ratio", "relMSE", "HDR-FLIP")]
+    rows = [("camera", "part", "mean ratio", "relMSE", "HDR-FLIP", "95th percentile")]
     for camera in report["cameras"]:
         for part in PARTS:
             f = camera[part]
-            rows.append((camera["name"], part, number(f["mean_ratio"]), number(f["relmse"]), number(f["flip"])))
-    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+            rows.append((camera["name"], part, number(f["mean_ratio"]), number(f["relmse"]), number(f["flip"]), ""))
+    f = report["receivers"]
+    rows.append(("receivers", "irradiance", number(f["mean_ratio"]), number(f["relmse"]), "", number(f["p95"])))
+    widths = [max(len(row[i]) for row in rows) for i in range(6)]
     return "\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows)

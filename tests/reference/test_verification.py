@@ -19,7 +19,7 @@ from bake_core.environment import no_images, read_environment
 from bake_core.errors import BundleError, Cancelled, InputError
 from bake_core.gltf.reader import load_scene
 from bake_core.images import read_exr
-from bake_core.irradiance import covered
+from bake_core.irradiance import covered, sample
 from bake_core.lights import merge_lights
 from bake_core.progress import Progress
 from bake_core.raster import Rasterizer
@@ -72,6 +72,12 @@ def test_the_cornell_box_lit_by_its_bundle_is_the_path_tracers(bundle: Bundle, s
                 assert f"{name}.png" in page
                 pixels, _ = read_exr(tmp_path / "out" / f"{name}.exr", InputError, "test.unreadable")
                 assert pixels.shape == (72, 128, 3)
+    assert report["receivers"]["count"] == 2048
+    assert report["receivers"]["samples"] == 16 * SMALL["samples"]
+    assert f"{report['receivers']['p95']:.4g}" in page
+    rows = json.loads((tmp_path / "out" / "receivers.json").read_text())
+    answers = sample(bundle.volumes, [r["position"] for r in rows], [r["normal"] for r in rows]).irradiance
+    np.testing.assert_allclose(answers, [r["irradiance"] for r in rows])
     first = report["cameras"][0]["files"]["whole"]
     raster, path, difference = (read_exr(tmp_path / "out" / f"{first[k]}.exr", InputError, "test.unreadable")[0] for k in first)
     np.testing.assert_allclose(difference, raster - path, atol=1e-5)
@@ -87,6 +93,8 @@ def test_a_bundle_whose_light_is_wrong_fails(bundle: Bundle, scene: Scene, tmp_p
     report = verify(replace(bundle, volumes=tuple(brighter)), scene, scene.cameras[:1], tmp_path / "out", **SMALL)
     assert not report["passed"]
     assert report["failures"][0].startswith("front: indirect: mean ratio 1.1")
+    assert 1.2 < report["receivers"]["mean_ratio"] < 1.27
+    assert report["receivers"]["relmse"] > 0.04
 
 
 def test_a_verification_replaces_an_older_one_and_nothing_else(bundle: Bundle, scene: Scene, tmp_path: Path) -> None:
@@ -177,9 +185,11 @@ def test_the_command_says_by_its_exit_code_whether_limits_are_kept(
     report = json.loads(capsys.readouterr().out)
     assert report["passed"]
     assert report["cameras"][0]["name"] == "one"
-    limits.write_text('{"whole": {"flip": 0}}')
+    limits.write_text('{"whole": {"flip": 0}, "receivers": {"p95": 0.001}}')
     assert main([*command, "--thresholds", str(limits), "-o", str(tmp_path / "b")]) == 5
     told = capsys.readouterr()
+    assert "2048 receivers, 512 paths from each" in told.out
+    assert "octobake: receivers: 95th percentile" in told.err
     assert "HDR-FLIP" in told.out
     assert "octobake: one: whole: HDR-FLIP" in told.err
     assert (tmp_path / "b" / "index.html").is_file()

@@ -59,6 +59,7 @@ def test_thresholds_default_to_the_cornell_boxs_and_may_be_given_in_part() -> No
     assert Thresholds().model_dump(mode="json") == {
         "indirect": {"mean_ratio": [0.95, 1.05], "relmse": 0.05, "flip": None},
         "whole": {"mean_ratio": None, "relmse": None, "flip": None},
+        "receivers": {"mean_ratio": None, "relmse": None, "p95": None},
     }
     given = parse_thresholds({"indirect": {"relmse": 0.01}, "whole": {"mean_ratio": [0.9, 1.1]}})
     assert given.indirect.mean_ratio is None

@@ -1,0 +1,129 @@
+"""Path-traced irradiance at receivers: the truth that a bundle's answers are held against.
+
+What arrives is measured as the query defines it: everything but the direct light of punctual and directional lights. Paths leave a receiver
+by the cosine, and one sample of the emitters and one of the sky go with each, weighted by the balance heuristic (Veach 1997): the same
+estimators as at any other vertex of a path, and no probe, texel or filter in between.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numba import uint32, uint64
+from numpy.typing import NDArray
+
+from bake_core.embree import new_rayhit
+from bake_core.environment import has_sky
+from bake_core.errors import Cancelled
+from bake_core.kernels import entry_kernel
+from bake_core.materials import INV_PI, lambert_cosine, no_gloss, sample_lambert
+from bake_core.receivers import Receivers, stand_on
+from bake_core.sampling import mix64, reverse_bits, sobol_pair
+from bake_core.transport import Tracer, from_emitters, from_sky, trace_path
+
+F64 = NDArray[np.float64]
+
+_CANCELLED, _DONE = 1, 0
+# Receivers a thread takes at once: a fraction of a second's work.
+_CHUNK = 32
+
+
+def path_traced_irradiance(
+    tracer: Tracer,
+    receivers: Receivers,
+    *,
+    samples: int,
+    scrambles: int,
+    seed: int,
+    threads: int = 1,
+    advance: Callable[[float], None] | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> F64:
+    """Irradiance at receivers by path tracing, to the spec's `max_bounces`; the same bits for any number of threads.
+
+    Parameters
+    ----------
+    samples : int
+        Paths from each receiver for each estimate.
+    scrambles : int
+        Independent estimates: their mean is the result, their spread its standard error.
+    advance : callable, optional
+        Told the fraction of the work that has been done since it was last called.
+    cancelled : (1,) uint8, optional
+        Set it from any thread to stop within one receiver.
+
+    Returns
+    -------
+    (scrambles, n, 3) float64
+        E about the shading normal, no 1/π inside. As surfaces reflect it: directions that the shading normal's hemisphere has below the
+        surface count mirrored (:mod:`bake_core.materials`).
+
+    Raises
+    ------
+    Cancelled
+    """
+    flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
+    out = np.zeros((scrambles, len(receivers), 3))
+
+    def trace(first: int) -> int:
+        part = slice(first, first + _CHUNK)
+        places = receivers.places.some(part)
+        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), places, first, samples, np.uint64(seed), flag, out[:, part])
+        return status
+
+    with ThreadPoolExecutor(threads) as pool:
+        for status in pool.map(trace, range(0, len(receivers), _CHUNK)):
+            if status == _CANCELLED:
+                raise Cancelled
+            if advance is not None:
+                advance(_CHUNK / len(receivers))
+    return out
+
+
+@entry_kernel
+def _irradiance_kernel(t, ray, places, first, samples, seed, cancelled, out):  # type: ignore[no-untyped-def]
+    """Mean over paths and light samples from each receiver for each scramble; `first` is the number of the first receiver."""
+    ray_bits = ray.view(np.uint32)
+    look = no_gloss(t)
+    for i in range(out.shape[1]):
+        p, n, epsilon, _ = stand_on(t, ray, ray_bits, places, i)
+        ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+        for scramble in range(out.shape[0]):
+            if cancelled[0]:
+                return _CANCELLED
+            key = mix64(mix64(seed) + (uint64(scramble) << uint64(32)) + uint64(first + i))
+            red = green = blue = 0.0
+            for sample in range(samples):
+                index = uint32(sample)
+                reversed_index = reverse_bits(index)
+                if t.emitters.cdf.shape[0]:
+                    choice, _ = sobol_pair(reversed_index, key + uint64(1))
+                    u, v = sobol_pair(reversed_index, key + uint64(2))
+                    r, g, b = from_emitters(t, ray, ray_bits, p, n, epsilon, False, look, u, v, choice)
+                    red += r
+                    green += g
+                    blue += b
+                if has_sky(t):
+                    u, v = sobol_pair(reversed_index, key + uint64(4))
+                    r, g, b = from_sky(t, ray, ray_bits, p, n, epsilon, False, look, u, v)
+                    red += r
+                    green += g
+                    blue += b
+                u, v = sobol_pair(reversed_index, key)
+                dx, dy, dz = sample_lambert(u, v, n)
+                # Of no width: a look-up in a texture that is as fine as it can be is no estimate of what a wider one would have found.
+                emitted, direct, indirect, _, light_pdf = trace_path(
+                    t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, False, 0.0
+                )
+                pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+                share = pdf / (pdf + light_pdf) if light_pdf > 0 else 1.0
+                red += share * emitted[0] + direct[0] + indirect[0]
+                green += share * emitted[1] + direct[1] + indirect[1]
+                blue += share * emitted[2] + direct[2] + indirect[2]
+            # Over the pdf cosθ/π, radiance times cosine is π times radiance.
+            scale = math.pi / samples
+            out[scramble, i, 0], out[scramble, i, 1], out[scramble, i, 2] = scale * red, scale * green, scale * blue
+    return _DONE
