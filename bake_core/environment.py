@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,9 +67,11 @@ def beside(folder: Path) -> Find:
             raise SpecError(
                 "spec.image_not_found", "only a service knows images by digest; give a path from the spec file", "environment.image"
             )
-        if not (folder / image).is_file():
-            raise SpecError("spec.image_not_found", f"there is no file {image!r} beside the spec", "environment.image")
-        return folder / image
+        # A name too long for any file is an OSError, or False, as Python's version has it.
+        with suppress(OSError):
+            if (folder / image).is_file():
+                return folder / image
+        raise SpecError("spec.image_not_found", f"there is no file {image[:200]!r} beside the spec", "environment.image")
 
     return find
 

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -60,10 +61,10 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
 def _write(path: Path, pixels: NDArray[np.generic], spec: oiio.ImageSpec) -> None:
     out = oiio.ImageOutput.create(str(path))
     if out is None or not out.open(str(path), spec):
-        raise BakeError("bake.cannot_write", (out.geterror() if out else oiio.geterror()) or "cannot be written", str(path))
+        raise BakeError("bake.cannot_write", (_complaint(out) if out else _complaint(oiio)) or "cannot be written", str(path))
     written = out.write_image(np.ascontiguousarray(pixels))
     if not (out.close() and written):
-        raise BakeError("bake.cannot_write", out.geterror() or "cannot be written; is the disk full?", str(path))
+        raise BakeError("bake.cannot_write", _complaint(out) or "cannot be written; is the disk full?", str(path))
 
 
 def read_exr(path: Path, error: type[InputError], slug: str) -> tuple[F32, bool]:
@@ -82,11 +83,11 @@ def read_exr(path: Path, error: type[InputError], slug: str) -> tuple[F32, bool]
     """
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise error(slug, oiio.geterror() or "cannot be read", path.name)
+        raise error(slug, _complaint(oiio) or "cannot be read", path.name)
     spec = source.spec()
     pixels = source.read_image("float")
     half = spec.format == oiio.HALF
-    complaint = source.geterror()
+    complaint = _complaint(source)
     source.close()
     if pixels is None:
         raise error(slug, complaint or "cannot be read", path.name)
@@ -117,10 +118,13 @@ def read_radiance(path: Path, error: type[InputError], slug: str, where: str) ->
         link.symlink_to(path.absolute())
         source = oiio.ImageInput.open(str(link))
         if source is None:
-            raise error(slug, _one_line(oiio.geterror() or "cannot be read"), where)
+            raise error(slug, _one_line(_complaint(oiio) or "cannot be read"), where)
         try:
             spec = source.spec()
-            names = list(spec.channelnames)
+            try:
+                names = list(spec.channelnames)
+            except UnicodeDecodeError:
+                raise error(slug, "has a channel whose name is not UTF-8; give R, G and B, or Y", where) from None
             if spec.width * spec.height * spec.depth > _MAX_RADIANCE_TEXELS:
                 raise error(slug, f"has {spec.width} × {spec.height} texels, more than 8192 × 4096", where)
             if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
@@ -128,7 +132,7 @@ def read_radiance(path: Path, error: type[InputError], slug: str, where: str) ->
             if not ({"R", "G", "B"} <= set(names) or names[0] == "Y"):
                 raise error(slug, f"has the channels {', '.join(names)}; give R, G and B, or Y", where)
             pixels = source.read_image("float")
-            complaint = source.geterror()
+            complaint = _complaint(source)
         finally:
             source.close()
     if pixels is None or complaint:
@@ -168,7 +172,7 @@ def decode_picture(data: bytes, error: type[InputError], slug: str, where: str) 
         spec = source.spec()
         dtype = np.uint16 if spec.format == oiio.UINT16 else np.uint8
         pixels = source.read_image("uint16" if dtype == np.uint16 else "uint8")
-        complaint = source.geterror()
+        complaint = _complaint(source)
         if pixels is None or complaint:
             raise error(slug, _one_line(complaint or "cannot be decoded"), where)
     channels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
@@ -195,13 +199,21 @@ def _opened(data: bytes, error: type[InputError], slug: str, where: str) -> Iter
         config.attribute("oiio:UnassociatedAlpha", 1)
         source = oiio.ImageInput.open(file.name, config)
         if source is None:
-            raise error(slug, _one_line(oiio.geterror() or "cannot be read"), where)
+            raise error(slug, _one_line(_complaint(oiio) or "cannot be read"), where)
         try:
             yield source
         finally:
             source.close()
 
 
+def _complaint(of: Any) -> str:
+    """What OpenImageIO, or one of its readers or writers, has to say; it may quote a broken file's bytes, which are no text."""
+    try:
+        return str(of.geterror())
+    except UnicodeDecodeError:
+        return "its header is damaged"
+
+
 def _one_line(complaint: str) -> str:
-    """A complaint of OpenImageIO's without its line breaks and its names of temporary files."""
-    return "cannot be decoded: " + re.sub(r' \("[^"]*"\)', "", complaint).strip().replace("\n", "; ")
+    """A complaint of OpenImageIO's: its first line, for the others follow from it, without names of temporary files."""
+    return "cannot be decoded: " + re.sub(r' \(("[^"]*"|/[^)]*)\)', "", complaint).strip().partition("\n")[0][:200]

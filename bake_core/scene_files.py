@@ -43,7 +43,7 @@ def load_scene_files(root: str, files: Mapping[str, Path]) -> Scene:
 def _mesh_or_zip(path: Path, name: str) -> Scene | None:
     if name.lower().endswith(SUFFIXES):
         return read_mesh_file(path, name)
-    if not zip_files.is_zip(path):
+    if not zip_files.is_zip(path) and not (name.lower().endswith(".zip") and path.is_file()):
         return None
     with tempfile.TemporaryDirectory(prefix="octobake-zip-") as folder:
         return reader.load_scene_files(*zip_files.unpack(path, Path(folder), name))

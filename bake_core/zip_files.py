@@ -9,7 +9,8 @@ from pathlib import Path, PurePosixPath
 
 from bake_core.errors import SceneError
 
-MAGIC = b"PK\x03\x04"
+# Of a zip, and of one with nothing in it.
+MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 MAX_ENTRIES = 4096
 MAX_BYTES = 1 << 33
 # Deflate cannot do better than 1032 : 1, and real scenes stay below 20 : 1.
@@ -22,7 +23,7 @@ _BLOCK = 1 << 20
 def is_zip(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return file.read(4) == MAGIC
+            return file.read(4) in MAGICS
     except OSError:
         return False
 
@@ -82,6 +83,8 @@ def _check(entries: list[zipfile.ZipInfo], packed: int, name: str) -> None:
         mode = e.external_attr >> 16
         if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
             raise SceneError("scene.unsafe_zip", "is a link or a device; only plain files are read", place)
+        if not 0 <= e.header_offset < packed:
+            raise SceneError("scene.bad_zip", "is not where the zip's directory says; pack it again", place)
         if e.filename in seen:
             raise SceneError("scene.bad_zip", "occurs twice", place)
         seen.add(e.filename)

@@ -88,6 +88,12 @@ class Blobs:
             obstore.put(self._store, key, path)
             path.unlink()
             return
+        if path.stat().st_dev != self.root.stat().st_dev:
+            # A file is renamed within one file system only, and /tmp is often another.
+            near = self.staging("upload")
+            shutil.copyfile(path, near)
+            path.unlink()
+            path = near
         with open(path, "rb") as f:
             os.fsync(f.fileno())
         final = self.root / key

@@ -6,12 +6,15 @@ Embedded, it is one worker process with one task slot; the kernels bring their o
 from __future__ import annotations
 
 import logging
+import os
+import shutil
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeAlias
 from uuid import uuid4
 
@@ -54,7 +57,7 @@ class Compute:
             if not settings.dask:
                 # Both addresses are given because the defaults are every interface, and port 8787 of it.
                 self._cluster = LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR)
-                self._worker = _EmbeddedWorker(self._cluster.scheduler_address, str(settings.data_folder / "scratch"))
+                self._worker = _EmbeddedWorker(self._cluster.scheduler_address, settings.temporary_folder / "worker")
             self._client = Client(self._cluster or settings.dask, set_as_default=False, timeout="10s")
         except (OSError, ValueError) as e:
             self.close()
@@ -115,8 +118,9 @@ class _EmbeddedWorker:
     Not Dask's nanny, which gives up on a worker that dies while it starts.
     """
 
-    def __init__(self, scheduler: str, folder: str) -> None:
-        self._command = [sys.executable, "-m", "service.worker_process", scheduler, folder]
+    def __init__(self, scheduler: str, folder: Path) -> None:
+        self._command = [sys.executable, "-m", "service.worker_process", scheduler, str(folder)]
+        self._folder = folder
         self._closing = threading.Event()
         self._process = self._start()
         self._thread = threading.Thread(target=self._watch, name="octobake-worker", daemon=True)
@@ -133,8 +137,11 @@ class _EmbeddedWorker:
         self._thread.join(CLOSE_SECONDS)
 
     def _start(self) -> subprocess.Popen[bytes]:
+        # What the one before was making when it died.
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(parents=True, exist_ok=True)
         # Its standard input is how it learns that this process has gone.
-        return subprocess.Popen(self._command, stdin=subprocess.PIPE)
+        return subprocess.Popen(self._command, stdin=subprocess.PIPE, env={**os.environ, "TMPDIR": str(self._folder)})
 
     def _watch(self) -> None:
         while not self._closing.is_set():

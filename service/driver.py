@@ -35,7 +35,7 @@ log = logging.getLogger("octobake.driver")
 
 # A task that has not ended this long after its cancel is in native code that polls no flag (building, compiling, Vulkan): its worker is
 # killed, so that the CPU is free within the second that is promised.
-STOP_SECONDS = 0.7
+STOP_SECONDS = 0.5
 # Before the first shard has been timed: paths a second on one thread, on the slow side, so that first shards are rather short.
 FIRST_GUESS_RATE = 200_000.0
 
@@ -277,17 +277,22 @@ class Driver:
     def _halt(self, running: dict[str, tuple[_Piece, Future[Any]]], begun: dict[str, str], wait: bool) -> None:
         """Stop what runs, and see to it that it has stopped."""
         self._compute.cancel([future for _, future in running.values()])
-        unheard = {key: address for key, address in begun.items() if key in running}
+        # Where each piece runs; None where it has not said so yet, though it may have begun.
+        unheard = {key: begun.get(key) for key in running}
         deadline = time.monotonic() + STOP_SECONDS
         while wait and unheard and (left := deadline - time.monotonic()) > 0:
             try:
                 news = self._inbox.get(timeout=left)
             except queue.Empty:
                 break
-            if isinstance(news, dict) and "ended" in news:
-                unheard.pop(news["key"], None)
+            if not isinstance(news, dict) or news["key"] not in unheard:
+                continue
+            if "ended" in news:
+                del unheard[news["key"]]
+            else:
+                unheard[news["key"]] = news["address"]
         if wait:
-            for address in set(unheard.values()):
+            for address in {a for a in unheard.values() if a is not None}:
                 self._compute.restart(address)
 
     def _lost(self, piece: _Piece, why: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import shutil
 
 from bake_core.errors import MachineError
 from service.blobs import Blobs
@@ -30,6 +31,8 @@ class Service:
             self._lock.close()
             text = "another octobake serves from this data folder; stop it, or give --data"
             raise MachineError("service.data_in_use", text, str(folder)) from None
+        self._sweep()
+        settings.temporary_folder.mkdir()
         self.blobs = Blobs(settings.store_url, folder / "scratch")
         self.blobs.clean()
         self.store = Store(settings.database_url)
@@ -43,4 +46,9 @@ class Service:
             self.scheduler.close()
         finally:
             self.store.close()
+            self._sweep()
             self._lock.close()
+
+    def _sweep(self) -> None:
+        """Remove what was in the making; a killed service leaves it to the next start."""
+        shutil.rmtree(self.settings.temporary_folder, ignore_errors=True)

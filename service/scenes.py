@@ -9,14 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bake_core.environment import Find
+from bake_core.environment import Find, read_environment
 from bake_core.errors import BakeError, SpecError
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene_files
+from bake_core.spec import ConstantEnvironment, EquirectEnvironment
 from service.blobs import DIGEST, Blobs
 
 # Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
 KEPT_OUTLINES = 64
+# Read one at a time: the largest takes 1 GB for a moment.
+_one_sky = threading.Lock()
 
 
 def load_stored(blobs: Blobs, scene: Mapping[str, Any]) -> Scene:
@@ -38,6 +41,18 @@ def find_stored(blobs: Blobs) -> Find:
             raise SpecError("spec.image_not_found", f"there is no blob {image}; put it with PUT /v1/blobs", "environment.image") from None
 
     return find
+
+
+def check_sky(blobs: Blobs, environment: ConstantEnvironment | EquirectEnvironment) -> None:
+    """Read a spec's environment as a worker will.
+
+    Raises
+    ------
+    SpecError
+        ``spec.image_*``.
+    """
+    with _one_sky:
+        read_environment(environment, find_stored(blobs))
 
 
 class Outlines:

@@ -48,6 +48,11 @@ class Settings:
         return Path(base).expanduser().absolute() / "octobake"
 
     @property
+    def temporary_folder(self) -> Path:
+        """Where files in the making lie: beside the data, for /tmp may be small, or memory. Emptied at every start."""
+        return self.data_folder / "temporary"
+
+    @property
     def database_url(self) -> str:
         """The job store's URL."""
         return self.database or f"sqlite:///{self.data_folder / 'octobake.sqlite'}"

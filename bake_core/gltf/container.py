@@ -138,7 +138,11 @@ def _open(name: str, path: Path, opener: Opener) -> Document:
 def _chunks(data: bytes, name: str, notes: Notes) -> tuple[bytes, memoryview | None]:
     """The JSON chunk and, where there is one, the binary chunk of a GLB (glTF 2.0, chapter 4)."""
     if len(data) < 4 or data[:4] != MAGIC:
-        fail("bad_magic", "is not a GLB file (it does not begin with 'glTF'); a JSON glTF must be named .gltf", name)
+        fail(
+            "bad_magic",
+            "is not a GLB file (it does not begin with 'glTF'); other scenes are told by their names: .gltf, .zip, .obj, .ply, .stl",
+            name,
+        )
     if len(data) < 20:
         fail("truncated", f"ends after {len(data)} bytes, inside the GLB header", name)
     version, length = struct.unpack_from("<II", data, 4)

@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import FrameType
 
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -42,9 +43,22 @@ def run(args: argparse.Namespace) -> int:
 
     spec = load_spec(args.spec)
     cancelled = np.zeros(1, np.uint8)
-    # Kernels run without the GIL and only look at this flag: Ctrl-C ends a bake within a texel.
-    previous = signal.signal(signal.SIGINT, lambda *_: cancelled.fill(1))
     line = ProgressLine(sys.stderr)
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        stage = line.last.stage if line.last else ""
+        if stage in ("tracing", "writing"):
+            # Kernels run without the GIL and only look at this flag: Ctrl-C ends a bake within a texel. A bundle is written whole.
+            cancelled.fill(1)
+        elif stage == "compiling":
+            # It may take a minute in a thread that nothing else stops, and there is no file yet to clear away.
+            line.close()
+            os.write(sys.stderr.fileno(), b"octobake: interrupted\n")
+            os._exit(130)
+        else:
+            signal.default_int_handler(signum, frame)
+
+    previous = signal.signal(signal.SIGINT, stop)
     try:
         result = bake(
             args.scene,

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -67,7 +68,10 @@ def run(args: argparse.Namespace) -> int:
             raise MachineError("service.cannot_listen", f"{e.strerror}; choose another with --host and --port", where) from None
         host = f"[{settings.host}]" if family == socket.AF_INET6 else settings.host
         url = f"http://{host}:{listener.getsockname()[1]}"
-        app = create_app(Service(settings))
+        service = Service(settings)
+        # For whatever of this process writes temporary files: a zip that is unpacked, Dask's scheduler.
+        os.environ["TMPDIR"] = tempfile.tempdir = str(settings.temporary_folder)
+        app = create_app(service)
         config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS, server_header=False)
         # A signal during start-up must end the process, too, and uvicorn listens for it only later.
         signal.signal(signal.SIGTERM, signal.default_int_handler)

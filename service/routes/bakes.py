@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from bake_core.placement import place
-from bake_core.spec import EquirectEnvironment, parse_spec
+from bake_core.spec import parse_spec
 from service import documents
 from service.jobs import Job, Kind, State
 from service.parts import Service
@@ -14,7 +14,7 @@ from service.routes.artefacts import GET_HEADERS, HEAD_HEADERS, artefact
 from service.routes.bodies import JsonRoute
 from service.routes.common import Here, failures
 from service.routes.jobs import accepted, add_job_routes, find, not_there
-from service.scenes import find_stored
+from service.scenes import check_sky
 
 PATH = "/v1/bakes"
 router = APIRouter(prefix=PATH, tags=["bakes"], route_class=JsonRoute)
@@ -39,10 +39,9 @@ def create_bake(body: documents.BakeRequest, service: Here, response: Response) 
     scene = service.store.scene(body.scene)
     if scene is None:
         raise RequestError("scene.unknown", f"there is no scene {body.scene}; add it with POST /v1/scenes", "body.scene", 422)
-    # Volumes that do not fit this scene, and skies that are not here, are refused now, not after a wait in the queue.
+    # Volumes that do not fit this scene, and skies that cannot be read, are refused now, not after a wait in the queue.
     place(service.outlines.get(body.scene, scene), spec)
-    if isinstance(spec.environment, EquirectEnvironment):
-        find_stored(service.blobs)(spec.environment.image)
+    check_sky(service.blobs, spec.environment)
     job = service.store.add_job(Kind.BAKE, {"scene": body.scene, "spec": spec.canonical()}, body.labels, body.priority)
     accepted(service, response, job, PATH)
     return _document(service, job, False)

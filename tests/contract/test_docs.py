@@ -86,9 +86,42 @@ def test_examples_of_specs_are_specs() -> None:
 
 
 def test_every_slug_of_the_spec_is_documented() -> None:
-    sources = "".join((ROOT / "bake_core" / f).read_text() for f in ("spec.py", "strict_json.py", "placement.py", "lights.py"))
-    used = set(re.findall(r'"(spec\.[a-z_]+)"', sources)) | {f"spec.{s}" for s in re.findall(r'f"\{area\}\.([a-z_]+)"', sources)}
+    used = {slug for slug in slugs() if slug.startswith("spec.")}
     assert set(re.findall(r"`(spec\.[a-z_]+)`", page("spec.md").split("## Every slug")[1])) == used
+
+
+# --- errors ----------------------------------------------------------------------------------------------------------------------------
+
+# Words with a dot that are names of files, of modules or of places in a request.
+NO_SLUGS = r"(json|html|glb|gltf|zip|glsl|vert|frag|log|js|css|exr|cli|url|id|scene|bake|cameras|thresholds|worker_process|txt)"
+AREAS = (
+    "bake|blob|bundle|camera|client|compute|demo|gltf|job|machine|request|sample|scene|service|settings|shaders|spec|thresholds"
+    "|verification|vulkan"
+)
+
+
+def slugs() -> set[str]:
+    """Every slug that the code can raise."""
+    texts = {p: p.read_text(encoding="utf-8") for top in ("bake_core", "service", "clients/python") for p in (ROOT / top).rglob("*.py")}
+    everything = "".join(texts.values())
+    found = {s for s in re.findall(rf'"((?:{AREAS})\.[a-z_]+)"', everything) if not re.fullmatch(rf"[a-z]+\.{NO_SLUGS}", s)}
+    # Those that are put together: the reader's, the strict JSON parser's, and the texels' of a sky.
+    reader = "".join(t for p, t in texts.items() if p.parent.name == "gltf")
+    found |= {f"gltf.{s}" for s in re.findall(r'fail\(\s*"([a-z_]+)"', reader) + re.findall(r'\("(unsupported_[a-z_]+)"', reader)}
+    strict = re.findall(r'f"\{area\}\.([a-z_]+)"', texts[ROOT / "bake_core" / "strict_json.py"])
+    areas = re.findall(r'strict_json\.parse\([^"]*"([a-z]+)"', everything) + re.findall(r'parse\([^"\n]*SceneError, "([a-z]+)"', reader)
+    found |= {f"{area}.{slug}" for area in areas for slug in strict}
+    found |= {f"spec.image_{s}" for s in re.findall(r'"([a-z_]+)", "is (?:not finite|negative)"', everything)}
+    return found - {"spec.image_"}
+
+
+def test_every_slug_is_documented_and_no_other() -> None:
+    text = "".join(page(name) for name in ("errors.md", "spec.md", "scenes.md"))
+    told = set(re.findall(rf"`((?:{AREAS})\.[a-z_]+)`", text))
+    told = {s for s in told if not re.fullmatch(rf"[a-z]+\.{NO_SLUGS}", s)}
+    general = re.compile(r"[a-z]+\.(bad_json|json_too_deep|duplicate_key|not_finite)")
+    assert {s for s in slugs() - told if not general.fullmatch(s)} == set()
+    assert told - slugs() == set()
 
 
 # --- the bundle ------------------------------------------------------------------------------------------------------------------------

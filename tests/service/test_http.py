@@ -8,12 +8,14 @@ import json
 from collections.abc import AsyncIterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
 from tests.faults.corpus import make_zip
+from tests.faults.documents import exr
 from tests.service.running import BOX, InProcess, box_spec
 
 HEX = hashlib.sha256(BOX).hexdigest()
@@ -311,8 +313,8 @@ def test_a_list_that_cannot_be(http: InProcess, query: str, where: str) -> None:
 
 
 def test_a_sky_is_a_blob(http: InProcess) -> None:
-    """Named by digest, and there before the bake is; a path would be the service's own."""
-    blob = b"any bytes: they are read when the bake is"
+    """Named by digest, and there before the bake is; a path would be the service's own. What is wrong with it: test_bad_documents.py."""
+    blob = exr(np.ones((4, 8, 3), np.float32))
     image = "sha256:" + hashlib.sha256(blob).hexdigest()
     scene = add_box(http)
 

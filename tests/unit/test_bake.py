@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bake_core.bake import BakeResult, Run, bake, empty_state, finish, prepare, shard_ranges, trace_shard
 from bake_core.bundle import read_bundle, read_report
 from bake_core.convergence import next_pass
+from bake_core.environment import beside
 from bake_core.errors import BakeError, Cancelled, SceneError
 from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
 from bake_core.gltf.reader import load_scene
@@ -24,6 +25,7 @@ from bake_core.progress import Progress
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from tests.baking import maps
+from tests.pavilion import pavilion_spec, write_pavilion
 from tests.scenes import add_square, sky
 from tests.unit.test_bundle import files
 
@@ -44,7 +46,7 @@ def small_cornell(**stop: Any) -> tuple[bytes, dict[str, Any]]:
 
 
 def test_the_same_bytes_for_any_threads_shards_and_packing(tmp_path: Path) -> None:
-    """Two volumes, all outputs, a pass that ends short: the manifest and every file that it names."""
+    """Two volumes, all outputs, a pass that ends short."""
     glb, spec = small_cornell()
     second = {"name": "low", "origin": [-0.5, 0.1, -0.5], "spacing": [1, 1, 1], "counts": [2, 1, 2]}
     small = {"distance": 16, "normal": 8, "visibility": 8}
@@ -53,15 +55,25 @@ def test_the_same_bytes_for_any_threads_shards_and_packing(tmp_path: Path) -> No
         "outputs": ["normal", "distance", "radiance", "visibility", "irradiance"],
         "resolution": small,
     }
+    (tmp_path / "scene.glb").write_bytes(glb)
+    assert baked_alike(tmp_path / "scene.glb", spec) == 2 * 6
+
+
+def test_the_same_bytes_with_textures_holes_gloss_and_a_sky(tmp_path: Path) -> None:
+    assert baked_alike(write_pavilion(tmp_path), pavilion_spec()) == 6
+
+
+def baked_alike(scene: Path, spec: dict[str, Any]) -> int:
+    """Bake in every way: the manifest and every file that it names are the same; the number of EXRs among them."""
     made = []
     for threads, shards, out in ((1, 1, "a"), (2, 1, "b"), (1, 3, "c"), (2, 3, "d.zip"), (3, 1000, "e")):
-        bake_into(tmp_path, glb, spec, out, threads=threads, shards=shards)
-        made.append(files(tmp_path / out))
-        read_bundle(tmp_path / out)
-    assert sum(name.endswith(".exr") for name in made[0]) == 2 * 6
+        bake(scene, parse_spec(spec), scene.parent / out, threads=threads, shards=shards, find=beside(scene.parent))
+        made.append(files(scene.parent / out))
+        read_bundle(scene.parent / out)
     for other in made[1:]:
         assert other.keys() == made[0].keys()
         assert [name for name in other if other[name] != made[0][name]] == []
+    return sum(name.endswith(".exr") for name in made[0])
 
 
 def test_a_bake_in_steps_through_bytes_is_the_same_bake(tmp_path: Path) -> None:

@@ -105,6 +105,18 @@ def test_meshes_come_in_neutral(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_scene_files(path.name, {path.name: path}).positions, scene.positions)
 
 
+def test_an_obj_of_relative_indices_polygons_and_any_encoding(tmp_path: Path) -> None:
+    """Indices count back from where they stand, not from the file's end; lines go on after a backslash; comments are of any encoding."""
+    path = tmp_path / "a.obj"
+    path.write_bytes(
+        b"# caf\xe9\nmtllib no.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3/1/1 -2/2/2 -1\no \xff\n"
+        b"v 5 5 5 1 0 0\r\nv 6 5 5\nv 6 6 5\nv 5 6 5\nusemtl x\nf -4 -3 \\\n-2//1 -1 # all\n"
+    )
+    found = world_triangles(load_scene(path))
+    expected = [[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[5, 5, 5], [6, 5, 5], [6, 6, 5]], [[5, 5, 5], [6, 6, 5], [5, 6, 5]]]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def test_an_obj_opens_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("mtllib ../secret.mtl\nusemtl x\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")

@@ -62,22 +62,22 @@ class Client:
     def put_blob(self, path: str | os.PathLike[str]) -> str:
         """Upload a file unless the service has it; answers its digest."""
         path = Path(path)
-        digest = file_digest(path)
-        url = f"/v1/blobs/{digest}"
-        if self._send("HEAD", url, missing=True).status_code == 404:
-            with open(path, "rb") as f:
-                # A length, so that the service can refuse what is too large before it is sent.
-                headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
-                self._send("PUT", url, content=iter(lambda: f.read(CHUNK), b""), headers=headers)
-        return digest
-
-    def add_scene(self, path: str | os.PathLike[str]) -> Scene:
-        """Upload a .glb, or a .gltf with the files it names, and have it read; what the service has is not sent again."""
-        path = Path(path)
         try:
-            files = {name: self.put_blob(file) for name, file in scene_files(path).items()}
+            digest = file_digest(path)
+            url = f"/v1/blobs/{digest}"
+            if self._send("HEAD", url, missing=True).status_code == 404:
+                with open(path, "rb") as f:
+                    # A length, so that the service can refuse what is too large before it is sent.
+                    headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
+                    self._send("PUT", url, content=iter(lambda: f.read(CHUNK), b""), headers=headers)
+            return digest
         except OSError as e:
             raise OctobakeClientError("client.unreadable", f"cannot be read: {e.strerror}", str(path)) from None
+
+    def add_scene(self, path: str | os.PathLike[str]) -> Scene:
+        """Upload a scene file, of a .gltf the files it names too, and have it read; what the service has is not sent again."""
+        path = Path(path)
+        files = {name: self.put_blob(file) for name, file in scene_files(path).items()}
         return Scene.of(self._send("POST", "/v1/scenes", json={"root": path.name, "files": files}).json())
 
     # Jobs

@@ -1,0 +1,56 @@
+"""The driver alone, with a stand-in for Dask: what it does about workers that say little."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from service import driver
+from service.driver import Driver
+from service.jobs import Kind
+from service.parts import Service
+
+
+class Future:
+    """A task that never ends."""
+
+    key = "task"
+
+    def add_done_callback(self, call: Callable[[Any], None]) -> None:
+        pass
+
+
+class Compute:
+    """One slot; remembers which workers it was told to restart."""
+
+    slots = 1
+
+    def __init__(self) -> None:
+        self.restarted: list[str] = []
+
+    def submit(self, *call: Any) -> Future:
+        return Future()
+
+    def cancel(self, futures: list[Any]) -> None:
+        pass
+
+    def restart(self, address: str) -> None:
+        self.restarted.append(address)
+
+
+@pytest.mark.parametrize(("news", "restarted"), [(["began"], ["a"]), (["began", "ended"], []), ([], [])])
+def test_a_task_that_begins_as_it_is_cancelled_is_stopped_too(
+    news: list[str], restarted: list[str], service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "STOP_SECONDS", 0.05)
+    compute: Any = Compute()
+    job = service.store.add_job(Kind.BAKE, {}, {}, 0)
+    it = Driver(job, service.settings, service.store, service.blobs, compute, service.hub)
+    it.cancel()
+    for what in news:
+        it.hear({"key": "task", "address": "a", what: True})
+    with pytest.raises(driver._Cancel):
+        it._one(len, "anything")
+    assert compute.restarted == restarted
