@@ -97,8 +97,8 @@ def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
 def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.bool_]:
     """Whether each point (n, 3) is within half a spacing of a volume's box: where a bundle's light can be held against the truth.
 
-    Farther out, the nearest cell answers, which is defined but no more than a guess. The spacing is the longest of the three: a cell answers
-    for points as far from its probes as that along its own longest side.
+    Farther out, the nearest cell answers, which is defined but no more than a guess. The spacing is the longest of the three: along that
+    side a cell answers for points as far from its probes.
     """
     positions = np.asarray(positions, np.float64)
     out = np.zeros(len(positions), np.bool_)

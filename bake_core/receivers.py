@@ -99,8 +99,11 @@ class _Probes(NamedTuple):
 
 def volume_boxes(volumes: Sequence[VolumeData]) -> F64:
     """Where a bundle's light can be held against the truth, (v, 2, 3), world: as :func:`bake_core.irradiance.covered` has it."""
-    reach = 0.5 + _SLACK
-    return np.array([[v.origin - reach * v.spacing, v.origin + (v.counts - 1 + reach) * v.spacing] for v in volumes]).reshape(-1, 2, 3)
+    boxes = []
+    for v in volumes:
+        reach = v.spacing.max() / 2 + _SLACK * v.spacing
+        boxes.append([v.origin - reach, v.origin + (v.counts - 1) * v.spacing + reach])
+    return np.array(boxes).reshape(-1, 2, 3)
 
 
 def draw_receivers(

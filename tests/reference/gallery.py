@@ -87,7 +87,7 @@ def measure(name: str, work: Path) -> dict[str, Any]:
 
 def side_by_side(files: list[Path], out: Path) -> None:
     """Pictures of one size as one, from left to right."""
-    row = np.concatenate([oiio.ImageBuf(str(f)).get_pixels(oiio.UINT8)[..., :3] for f in files], 1)
+    row = np.concatenate([np.asarray(oiio.ImageBuf(str(f)).get_pixels(oiio.UINT8))[..., :3] for f in files], 1)
     spec = oiio.ImageSpec(row.shape[1], row.shape[0], 3, oiio.UINT8)
     spec.attribute("Compression", "jpeg:90")
     writer = oiio.ImageOutput.create(str(out))
