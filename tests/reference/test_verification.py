@@ -12,7 +12,6 @@ import pytest
 
 from bake_core import examples
 from bake_core.automatic_cameras import automatic_cameras
-from bake_core.bake import bake
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.cameras import parse_cameras
 from bake_core.environment import no_images, read_environment
@@ -24,7 +23,7 @@ from bake_core.lights import merge_lights
 from bake_core.progress import Progress
 from bake_core.raster import Rasterizer
 from bake_core.scene import Scene
-from bake_core.spec import load_spec, parse_spec
+from bake_core.spec import parse_spec
 from bake_core.textures import texture_table
 from bake_core.thresholds import Thresholds, load_thresholds
 from bake_core.verification import verify
@@ -194,12 +193,3 @@ def test_the_command_says_by_its_exit_code_whether_limits_are_kept(
     assert "octobake: one: whole: HDR-FLIP" in told.err
     assert (tmp_path / "b" / "index.html").is_file()
     assert main([*command[:3], str(tmp_path / "none.glb"), "-o", str(tmp_path / "c")]) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rtxgi_cornell", "rtxgi_furnace"])
-def test_shared_scenes_keep_the_default_limits(shared: Path, name: str, tmp_path: Path) -> None:
-    scene = shared / "scenes" / f"{name}.glb"
-    bake(scene, load_spec(shared / "specs" / f"{name}.json"), tmp_path / "bundle", threads=THREADS, shards=1)
-    report = verify(read_bundle(tmp_path / "bundle"), load_scene(scene), None, tmp_path / "out", **SMALL)
-    assert report["failures"] == []
