@@ -93,7 +93,8 @@ def exactly(path: Path) -> Find:
 
 def no_images(image: str) -> Path:
     """Where there is no place to look for images."""
-    raise SpecError("spec.image_not_found", f"{image!r} cannot be looked up here; say where the image is", "environment.image")
+    what = f"{image!r} cannot be looked up here; say where the image is (octobake verify: --sky FILE)"
+    raise SpecError("spec.image_not_found", what, "environment.image")
 
 
 def read_environment(
