@@ -37,7 +37,7 @@ from bake_core.scene_files import load_scene
 from bake_core.selection import Selection, select
 from bake_core.spec import Spec
 from bake_core.tally import State, Tally
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64

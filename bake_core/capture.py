@@ -20,10 +20,13 @@ from bake_core.embree import intersect1, new_rayhit, set_ray
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import either, entry_kernel, kernel
+from bake_core.next_event import sample_emitter
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
+from bake_core.surfaces import MAX_PASSED, blocked, surface
 from bake_core.textures import lets_through
-from bake_core.transport import MAX_PASSED, Tracer, blocked, sample_emitter, surface, trace_path
+from bake_core.tracer import Tracer
+from bake_core.transport import trace_path
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -213,7 +213,7 @@ def look_up_sky(sky: Sky, directions: F64) -> F64:
     return out
 
 
-# The kernels below take :class:`bake_core.transport.Tables`.
+# The kernels below take :class:`bake_core.tracer.Tables`.
 
 # Whether there is an image (t).
 has_sky = either("sky")(lambda t: True)(lambda t: False)

@@ -110,7 +110,7 @@ def _gloss(t, base, metallic, roughness, dx, dy, dz, n):  # type: ignore[no-unty
 
     Parameters
     ----------
-    t : bake_core.transport.Tables
+    t : bake_core.tracer.Tables
     base : 3 float64
         Taken as 1 where above: more than all of the light has no series.
     dx, dy, dz : float
@@ -238,7 +238,7 @@ def _no_gloss(t):  # type: ignore[no-untyped-def]
     return (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), _BLACK, 1.0, 1.0, 1.0, _BLACK, _BLACK, _BLACK, 0.0
 
 
-# The kernels below take :class:`bake_core.transport.Tables`; where nothing is glossy they are Lambert's alone.
+# The kernels below take :class:`bake_core.tracer.Tables`; where nothing is glossy they are Lambert's alone.
 
 # Whether a point is (t, metallic, roughness).
 is_glossy = either("gloss")(lambda t, metallic, roughness: metallic > 0 or roughness < 1)(lambda t, metallic, roughness: False)

@@ -16,7 +16,8 @@ from bake_core.kernels import entry_kernel
 from bake_core.progress import Progress, ProgressCallback
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.scene import Camera
-from bake_core.transport import Tracer, trace_path
+from bake_core.tracer import Tracer
+from bake_core.transport import trace_path
 
 F32 = NDArray[np.float32]
 _CANCELLED, _DONE = 1, 0

@@ -15,7 +15,7 @@ from bake_core.irradiance import sample
 from bake_core.receiver_irradiance import path_traced_irradiance
 from bake_core.receivers import Receivers, draw_receivers
 from bake_core.scene import Scene
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 
 F64 = NDArray[np.float64]
 

@@ -20,9 +20,11 @@ from bake_core.environment import has_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel
 from bake_core.materials import INV_PI, lambert_cosine, no_gloss, sample_lambert
+from bake_core.next_event import from_emitters, from_sky
 from bake_core.receivers import Receivers, stand_on
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
-from bake_core.transport import Tracer, from_emitters, from_sky, trace_path
+from bake_core.tracer import Tracer
+from bake_core.transport import trace_path
 
 F64 = NDArray[np.float64]
 

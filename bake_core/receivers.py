@@ -27,9 +27,10 @@ from bake_core.materials import sample_lambert
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.scene import Scene
 from bake_core.surface_sampling import Places, SurfaceSampler
+from bake_core.surfaces import MAX_PASSED, blocked, surface
 from bake_core.tally import BACKFACE_LIMIT
 from bake_core.textures import lets_through
-from bake_core.transport import MAX_PASSED, Tracer, blocked, surface
+from bake_core.tracer import Tracer
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -180,7 +181,7 @@ def _probe_table(volumes: Sequence[VolumeData], origin: F64) -> _Probes:
 
 @kernel
 def stand_on(t, ray, ray_bits, places, i):  # type: ignore[no-untyped-def]
-    """What :func:`bake_core.transport.surface` says of a place, as if a ray had just met it on that side.
+    """What :func:`bake_core.surfaces.surface` says of a place, as if a ray had just met it on that side.
 
     Returns
     -------

@@ -18,7 +18,7 @@ from bake_core.kernels import entry_kernel, kernel
 from bake_core.sampling import mix64, random_pair, reverse_bits, sobol_pair, uniform_triangle
 from bake_core.scene import Scene
 from bake_core.textures import opacity
-from bake_core.transport import Tables, Tracer
+from bake_core.tracer import Tables, Tracer
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -320,7 +320,7 @@ def _opacity(x, material, triangle, b1, b2):  # type: ignore[no-untyped-def]
     return value
 
 
-# The kernels below take :class:`bake_core.transport.Tables`, and are nothing but the material's own columns where it has no textures.
+# The kernels below take :class:`bake_core.tracer.Tables`, and are nothing but the material's own columns where it has no textures.
 
 
 def _has_holes(t):  # type: ignore[no-untyped-def]
@@ -479,7 +479,7 @@ def mean_emission(tables: Any, scene: Scene) -> F64:
 
     Parameters
     ----------
-    tables : bake_core.transport.Tables
+    tables : bake_core.tracer.Tables
     """
     out = np.zeros(len(scene.triangle_material))
     emissive = scene.materials.emission.max(axis=1, initial=0) > 0

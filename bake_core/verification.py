@@ -29,7 +29,7 @@ from bake_core.receiver_comparison import compare_receivers, measure_receivers
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
 from bake_core.thresholds import Thresholds
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 from bake_core.verification_report import PARTS, page, write_pictures
 from bake_core.vulkan import Device
 

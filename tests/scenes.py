@@ -16,7 +16,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.scene import Camera, Scene
 from bake_core.spec import parse_spec
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 
 Array = NDArray[Any]
 

@@ -19,7 +19,7 @@ from bake_core.receiver_irradiance import path_traced_irradiance
 from bake_core.receivers import Receivers, draw_receivers
 from bake_core.scene import Scene
 from bake_core.spec import parse_spec
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 from tests.baking import bake_example
 from tests.receivers import volume
 from tests.scenes import SQUARE, add_square, build, load, polygon_irradiance, sky

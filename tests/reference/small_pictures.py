@@ -19,7 +19,7 @@ from bake_core.raster import Rasterizer
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
 from bake_core.textures import texture_table
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 from bake_core.vulkan import Device
 from tests.baking import THREADS
 from tests.conformance import synthetic

@@ -16,7 +16,7 @@ from bake_core.errors import Cancelled
 from bake_core.examples import closed_box, plane_under_sun, square_emitter, two_rooms
 from bake_core.octahedral import texel_directions
 from bake_core.scene import Scene
-from bake_core.transport import Tracer
+from bake_core.tracer import Tracer
 from tests.scenes import build, sky, square_scene
 from tests.unit.gltf_build import face_normals, world_triangles
 from tests.unit.test_octahedral import quadrature

@@ -16,7 +16,7 @@ from bake_core.embree import intersect1, new_rayhit, set_ray
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.octahedral import texel_directions
 from bake_core.scene import Scene
-from bake_core.transport import surface
+from bake_core.surfaces import surface
 from tests.scenes import build, load
 from tests.unit.gltf_build import face_normals, world_triangles
 
