@@ -51,8 +51,10 @@ class Samples:
     volume: I64
 
 
-def sample(volumes: Sequence[VolumeData], positions: ArrayLike, normals: ArrayLike, wo: ArrayLike | None = None) -> Samples:
-    """Irradiance at surface points. Mirrors ``obIrradiance``.
+def sample(
+    volumes: Sequence[VolumeData], positions: ArrayLike, normals: ArrayLike, wo: ArrayLike | None = None, toward: ArrayLike | None = None
+) -> Samples:
+    """Irradiance at surface points. Mirrors ``obIrradiance`` and ``obIrradianceToward``.
 
     Parameters
     ----------
@@ -64,10 +66,12 @@ def sample(volumes: Sequence[VolumeData], positions: ArrayLike, normals: ArrayLi
         Unit. Not renormalised.
     wo : (n, 3) float, optional
         Unit, to the viewer; the normals where left out.
+    toward : (n, 3) float, optional
+        Unit, the way that the plane faces on which light arrives; the normals where left out.
     """
     positions = np.asarray(positions, np.float64).reshape(-1, 3)
     normals = np.asarray(normals, np.float64).reshape(-1, 3)
-    wo = normals if wo is None else np.asarray(wo, np.float64).reshape(-1, 3)
+    wo, toward = (normals if d is None else np.asarray(d, np.float64).reshape(-1, 3) for d in (wo, toward))
     chosen = select_volume(volumes, positions)
     out = Samples(np.zeros((len(positions), 3)), np.zeros((len(positions), 8)), np.zeros((len(positions), 8), np.int64), chosen)
     for v, volume in enumerate(volumes):
@@ -75,7 +79,7 @@ def sample(volumes: Sequence[VolumeData], positions: ArrayLike, normals: ArrayLi
         of_volume = np.flatnonzero(chosen == v)
         for first in range(0, len(of_volume), CHUNK):
             at = of_volume[first : first + CHUNK]
-            out.irradiance[at], out.weights[at], out.probes[at] = _in_volume(volume, table, positions[at], normals[at], wo[at])
+            out.irradiance[at], out.weights[at], out.probes[at] = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
     return out
 
 
@@ -125,13 +129,13 @@ def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
     return base, g - base
 
 
-def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64) -> tuple[F64, F64, I64]:
+def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64, toward: F64) -> tuple[F64, F64, I64]:
     """Mirrors ``obIrradianceInVolume``: irradiance, weights and probes; `table` is the volume's probe table, one row a probe."""
     n = len(positions)
     base, fraction = cell(volume, positions)
     normal_bias, view_bias = surface_bias(volume)
     biased = positions + normals * normal_bias + wo * view_bias
-    oct_normal = dir_to_oct(normals)
+    oct_toward = dir_to_oct(toward)
     probes = np.empty((n, 8), np.int64)
     trilinear, other, light = np.empty((n, 8)), np.empty((n, 8)), np.empty((n, 8, 3))
     for corner in range(8):
@@ -143,7 +147,7 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
         probes[:, corner] = probe
         other[:, corner] = _crush(weight) * table[probe, 3]
         trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
-        light[:, corner] = bilinear(volume.atlases["irradiance"], probe, oct_normal)
+        light[:, corner] = bilinear(volume.atlases["irradiance"], probe, oct_toward)
     weights = trilinear * other
     # Where nothing is left, the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
     weights = np.where(weights.sum(-1, keepdims=True) > 0, weights, other)

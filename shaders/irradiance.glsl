@@ -42,12 +42,12 @@ float obCrush(float weight) {
 }
 
 // Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
-// (facing times visibility, crushed) times the probe's state (1, or 0 inside geometry).
-vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo) {
+// (facing times visibility, crushed) times the probe's state (1, or 0 inside geometry). They are the surface's, whichever way is asked.
+vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 toward) {
     ObVolume volume = obVolume(v);
     ObCell cell = obCell(volume, position);
     vec3 biased = position + normal * volume.normalBias + wo * volume.viewBias;
-    vec2 octNormal = obDirToOct(normal);
+    vec2 octToward = obDirToOct(toward);
     vec4 sum = vec4(0.0);
     vec4 rest = vec4(0.0);
     for (int corner = 0; corner < 8; ++corner) {
@@ -58,7 +58,7 @@ vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo) {
         vec3 probePosition = volume.origin + volume.spacing * vec3(probe) + state.xyz;
         float weight = obFacing(probePosition - position, normal) * obVisibility(v, volume, tile, biased - probePosition);
         weight = obCrush(weight) * state.w;
-        vec3 irradiance = OB_IRRADIANCE(v, obTileCoordinates(volume, tile, volume.irradianceTexels, octNormal));
+        vec3 irradiance = OB_IRRADIANCE(v, obTileCoordinates(volume, tile, volume.irradianceTexels, octToward));
         vec3 axes = mix(1.0 - cell.fraction, cell.fraction, vec3(upper));
         sum += vec4(irradiance, 1.0) * (weight * axes.x * axes.y * axes.z);
         rest += vec4(irradiance, 1.0) * weight;
@@ -82,11 +82,17 @@ int obSelectVolume(vec3 position) {
     return nearest;
 }
 
-// The one entry point for diffuse light: irradiance E (the integral of radiance times cosine over the hemisphere, no 1/pi inside)
-// that arrives at a surface point, except the direct light of punctual and directional lights. Reflected radiance is albedo * E / pi.
+// The entry point for diffuse light: irradiance E (the integral of radiance times cosine over the hemisphere, no 1/pi inside) that arrives at
+// a surface point, except the direct light of punctual and directional lights. Reflected radiance is albedo * E / pi.
 //   position  the point, in the frame of constants.glsl
 //   normal    unit shading normal, on the side that is seen
 //   wo        unit, from the point to the viewer; the normal itself where there is none
 vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
-    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo);
+    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, normal);
+}
+
+// The same through the point, but on a plane that faces another way: for lobes that are not about the normal.
+//   toward    unit, any direction
+vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
+    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, toward);
 }

@@ -92,3 +92,11 @@ vec3 glossValue(Gloss g, vec3 wi, vec3 ng) {
     float above = dot(wi, ng);
     return above > 0.0 ? unfolded(g, wi) + unfolded(g, wi - 2.0 * above * ng) : vec3(0.0);
 }
+
+// Mean cosine of a lobe about its mean direction, as far as light that varies slowly can tell lobes apart. At roughness 1 GGX is symmetric
+// about the normal: f cos is iz / (oz + iz), up to a factor. A mirror's is 1. Between the two by alpha.
+float lobeCosine(Gloss g) {
+    float c = max(dot(g.wo, g.normal), 1e-4);
+    float l = log((1.0 + c) / c);
+    return mix(1.0, (0.5 - c + c * c * l) / (1.0 - c * l), g.alpha);
+}

@@ -30,8 +30,11 @@ void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i < count) {
         vec3 position = inputs[3 * i].xyz;
+        vec3 normal = inputs[3 * i + 1].xyz;
+        vec3 wo = inputs[3 * i + 2].xyz;
         int v = obSelectVolume(position);
-        outputs[i] = vec4(obIrradiance(position, inputs[3 * i + 1].xyz, inputs[3 * i + 2].xyz), float(v));
+        outputs[2 * i] = vec4(obIrradiance(position, normal, wo), float(v));
+        outputs[2 * i + 1] = vec4(obIrradianceToward(position, normal, wo, -wo), 0.0);
     }
 }
 """
@@ -62,17 +65,19 @@ def run(source: str, inputs: Sequence[NDArray[np.float64]], rows: int, volumes: 
 
 
 def query(volumes: Sequence[VolumeData], *points: NDArray[np.float64]) -> NDArray[np.float32]:
-    return run(HEADER + probe_module(volumes, 2) + QUERY, points, 1, volumes)[:, 0]
+    """(n, 2, 4): irradiance and volume; irradiance toward where the viewer does not stand."""
+    return run(HEADER + probe_module(volumes, 2) + QUERY, points, 2, volumes)
 
 
 def test_the_irradiance_query_agrees_with_its_numpy_twin() -> None:
     volumes = synthetic.volumes()
     points = synthetic.points(20000)
-    found = query(volumes, *points)
+    found, toward = query(volumes, *points).swapaxes(0, 1)
     expected = irradiance.sample(volumes, *points)
+    behind = irradiance.sample(volumes, *points, toward=-points[2]).irradiance
     # Volumes meet no point of the set at their borders but exactly, where both sides decide alike.
     np.testing.assert_array_equal(found[:, 3], expected.volume)
-    difference = np.abs(found[:, :3] - expected.irradiance).max(-1)
+    difference = np.maximum(np.abs(found[:, :3] - expected.irradiance), np.abs(toward[:, :3] - behind)).max(-1)
     brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
     assert np.isfinite(found).all()
     assert difference.max() < 5e-6 * brightest, f"worst at {points[0][difference.argmax()]}"
@@ -81,7 +86,7 @@ def test_the_irradiance_query_agrees_with_its_numpy_twin() -> None:
 def test_the_irradiance_query_agrees_with_the_fixtures() -> None:
     data = json.loads((Path(__file__).parents[1] / "conformance" / "irradiance.json").read_text(encoding="utf-8"))
     columns = {k: np.array([row[k] for row in data["queries"]]) for k in ("position", "normal", "wo", "irradiance", "volume")}
-    found = query(synthetic.volumes(), columns["position"], columns["normal"], columns["wo"])
+    found = query(synthetic.volumes(), columns["position"], columns["normal"], columns["wo"])[:, 0]
     np.testing.assert_array_equal(found[:, 3], columns["volume"])
     np.testing.assert_allclose(found[:, :3], columns["irradiance"], atol=4e-5)
 
@@ -89,7 +94,7 @@ def test_the_irradiance_query_agrees_with_the_fixtures() -> None:
 def test_one_volume_is_enough() -> None:
     volume = synthetic.volume("alone", (0, 0, 0), (1, 1, 1), (1, 1, 1), seed=9)
     _, normals, wo = synthetic.points(50)
-    found = query((volume,), normals * 0.3, normals, wo)
+    found = query((volume,), normals * 0.3, normals, wo)[:, 0]
     expected = irradiance.sample((volume,), normals * 0.3, normals, wo)
     np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
 
@@ -99,7 +104,7 @@ def test_as_many_volumes_as_a_spec_may_have() -> None:
     volumes = tuple(synthetic.volume(f"v{i}", (2.0 * i, 0, 0), (1, 1, 1), (2, 2 + i % 3, 1 + i % 2), seed=i) for i in range(64))
     position = np.stack([np.arange(64) * 2 + 0.4, np.full(64, 0.3), np.full(64, 0.2)], -1)
     normal = np.tile([0.0, 0.6, 0.8], (64, 1))
-    found = query(volumes, position, normal, normal)
+    found = query(volumes, position, normal, normal)[:, 0]
     expected = irradiance.sample(volumes, position, normal)
     np.testing.assert_array_equal(found[:, 3], np.arange(64))
     np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
