@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import asdict
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.bake import BakeResult, Run, bake, empty_state, finish, prepare, shard_ranges, trace_shard
+from bake_core.bake import BakeResult, bake, empty_state, finish, prepare, shard_ranges, trace_shard
 from bake_core.bundle import read_bundle, read_report
 from bake_core.convergence import next_pass
 from bake_core.environment import beside
@@ -22,6 +23,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
 from bake_core.octahedral import texel_directions, with_border
 from bake_core.progress import Progress
+from bake_core.report import Run
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from tests.baking import maps
@@ -155,7 +157,7 @@ def test_the_curve_has_a_point_for_each_doubling_and_errors_fall(tmp_path: Path)
     assert result.manifest["error"] == {"value": errors[-1], "target": None, "scrambles": 4}
     report = read_report(tmp_path / "out")
     assert report is not None
-    assert report["curve"] == [{"samples": p.samples, "seconds": p.seconds, "error": p.error} for p in result.run.curve]
+    assert report["curve"] == [asdict(p) for p in result.run.curve]
     assert set(report["stages"]) == {"reading", "building", "compiling", "tracing", "writing"}
 
 

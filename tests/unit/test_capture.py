@@ -196,7 +196,7 @@ def test_distances_normals_and_sides_in_a_box_and_outside_it() -> None:
     """Slabs: the nearest wall along each texel's direction."""
     tracer = build(load_example(closed_box(0.5, 1.0)[0]))
     inside, outside = np.array([0.3, -0.2, 0.5]), np.array([0.0, 3.0, 0.0])
-    distance, normal, back = capture_distance(tracer, np.stack([inside, outside]), 16, cancelled=np.zeros(1, np.uint8))
+    distance, normal, back, _ = capture_distance(tracer, np.stack([inside, outside]), 16, cancelled=np.zeros(1, np.uint8))
     d = normals(16)
     d[d == 0] = 1e-300  # a texel's centre on a fold
     steps = (np.sign(d) - inside) / d
@@ -215,6 +215,6 @@ def test_distances_normals_and_sides_in_a_box_and_outside_it() -> None:
 def test_backs_of_double_sided_surfaces_are_no_backs() -> None:
     for double_sided in (False, True):
         tracer = build(square_scene(double_sided=double_sided))
-        distance, _, back = capture_distance(tracer, np.array([[0.0, -0.5, 0.0]]), 16, cancelled=np.zeros(1, np.uint8))
+        distance, _, back, _ = capture_distance(tracer, np.array([[0.0, -0.5, 0.0]]), 16, cancelled=np.zeros(1, np.uint8))
         assert np.isfinite(distance).any()
         assert back.any() != double_sided
