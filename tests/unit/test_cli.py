@@ -202,10 +202,18 @@ def test_a_broken_machine_is_3(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.glb", "spec.json"]
 
 
-@pytest.mark.parametrize(("stage", "code", "says"), [("tracing", 3, "[bake.cancelled]"), ("compiling", 130, "interrupted")])
-def test_ctrl_c_ends_a_bake_at_once_and_leaves_nothing(stage: str, code: int, says: str, tmp_path: Path) -> None:
-    """As a process of its own: a line, no traceback, no file; where kernels must be compiled first, too."""
-    glb, spec = closed_box(0.99, 1.0)
+@pytest.mark.parametrize(
+    ("stage", "albedo", "sent", "code", "says"),
+    [
+        ("tracing", 0.999, signal.SIGINT, 3, "[bake.cancelled]"),
+        ("compiling", 0.5, signal.SIGINT, 130, "interrupted"),
+        ("pass done", 0.5, signal.SIGINT, 4, "interrupted; the bundle holds what"),
+        ("pass done", 0.5, signal.SIGTERM, 4, "interrupted; the bundle holds what"),
+    ],
+)
+def test_ctrl_c_ends_a_bake_at_once(stage: str, albedo: float, sent: signal.Signals, code: int, says: str, tmp_path: Path) -> None:
+    """As a process of its own: a line, no traceback; no file before the first pass has ended, a bundle of the best so far from then on."""
+    glb, spec = closed_box(albedo, 1.0)
     scene, spec_file = write(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}})
     command = [sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())"]
     kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if stage == "compiling" else {}
@@ -221,15 +229,21 @@ def test_ctrl_c_ends_a_bake_at_once_and_leaves_nothing(stage: str, code: int, sa
         assert process.stderr is not None
         while stage not in (line := process.stderr.readline()):
             assert line, "the bake ended by itself"
-        process.send_signal(signal.SIGINT)
-        sent = time.perf_counter()
+        process.send_signal(sent)
+        sent_at = time.perf_counter()
         out, err = process.communicate(timeout=20)
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == code and time.perf_counter() - sent < 3
-    assert out == "" and says in err and "Traceback" not in err
-    assert {p.name for p in tmp_path.iterdir()} <= {"scene.glb", "spec.json", "kernels"}
+    assert process.returncode == code and time.perf_counter() - sent_at < 3
+    assert says in err and "Traceback" not in err
+    left = {p.name for p in tmp_path.iterdir()} - {"scene.glb", "spec.json", "kernels"}
+    if code != 4:
+        assert out == "" and not left
+        return
+    assert left == {"out"}
+    manifest = read_bundle(tmp_path / "out").manifest
+    assert manifest["stopped"] == "interrupt" and manifest["samples"] >= 16 and f"{manifest['samples']} samples" in out
 
 
 # --- plan, info ------------------------------------------------------------------------------------------------------------------------
