@@ -137,7 +137,7 @@ class Driver:
         clock.stage("compiling")
         self._one(worker.compile_kernels, work)
         clock.stage("tracing")
-        run = Run(threads, 1, None if merged else self._seconds(), [p.point for p in merged])
+        run = Run(threads, 1, None if passes else self._seconds(), [p.point for p in merged])
         if merged:
             clock.measured(merged[-1].last, merged[-1].error)
             run.stopped = decide(spec.stop, merged[-1].last, merged[-1].error, self._seconds_before)

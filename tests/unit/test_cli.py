@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ import pytest
 
 from bake_core import irradiance
 from bake_core.bundle import content_digest, read_bundle
+from bake_core.convergence import Point
 from bake_core.examples import closed_box, square_emitter
+from bake_core.progress import Progress
 from service.cli import COMMANDS, main, parser
+from service.cli.progress import ProgressLine, count
 from tests.faults.corpus import Fault, corpus
 
 FEW = {"target_error": None, "max_samples": 4}
@@ -246,6 +250,40 @@ def test_ctrl_c_ends_a_bake_at_once(stage: str, albedo: float, sent: signal.Sign
     assert manifest["stopped"] == "interrupt" and manifest["samples"] >= 16 and f"{manifest['samples']} samples" in out
 
 
+@pytest.mark.parametrize(("times", "code"), [(1, 4), (2, 130)])
+def test_a_second_ctrl_c_writes_nothing(times: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: Any) -> None:
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(ProgressLine, "point", interrupt)
+    glb, spec = closed_box(0.5, 1.0)
+    scene, spec_file = write(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}})
+    assert main(["bake", scene, "--spec", spec_file, "-o", str(tmp_path / "out")]) == code
+    assert {p.name for p in tmp_path.iterdir()} - {"scene.glb", "spec.json"} == ({"out"} if code == 4 else set())
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_new_point_stays_above_the_line_that_is_redrawn(terminal: bool) -> None:
+    class Stream(StringIO):
+        def isatty(self) -> bool:
+            return terminal
+
+    stream = Stream()
+    line = ProgressLine(stream)
+    line(Progress("tracing", 0.5))
+    line.point(Point(64, 3_140_000, 12.4, 0.031))
+    # What a terminal shows of it: each line as it was last drawn.
+    shown = [part.split("\r")[-1].replace("\x1b[K", "") for part in stream.getvalue().split("\n")]
+    assert "pass done: 64 samples, 3.1 M rays, 12 s, error 3.1 %" in shown
+    assert ("tracing  50 %" in shown[-1]) == terminal
+
+
+@pytest.mark.parametrize(("number", "text"), [(0, "0"), (999, "999"), (12_345, "12 k"), (3_140_000, "3.1 M"), (5_000_000_000, "5.0 G")])
+def test_large_numbers_are_short(number: int, text: str) -> None:
+    assert count(number) == text
+
+
 # --- plan, info ------------------------------------------------------------------------------------------------------------------------
 
 
@@ -264,7 +302,17 @@ def test_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_info(baked: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(baked)]) == 0
     text = capsys.readouterr().out
-    for word in ("bundle", "sha256:", "1×1×1 probes, 1 active", "irradiance", "stored as float", "left out", "seconds"):
+    for word in (
+        "bundle",
+        "sha256:",
+        "1×1×1 probes, 1 active",
+        "irradiance",
+        "stored as float",
+        "left out",
+        "seconds",
+        "rays",
+        "against samples",
+    ):
         assert word in text
     assert main(["info", str(baked), "--json"]) == 0
     told = document(capsys)
