@@ -253,7 +253,7 @@ def test_ctrl_c_ends_a_bake_at_once(stage: str, albedo: float, sent: signal.Sign
 @pytest.mark.parametrize(("times", "code"), [(1, 4), (2, 130)])
 def test_a_second_ctrl_c_writes_nothing(times: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: Any) -> None:
-        for _ in range(times):
+        for _number in range(times):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(ProgressLine, "point", interrupt)
