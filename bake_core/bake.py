@@ -11,9 +11,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,14 @@ from bake_core import bundle, report
 from bake_core.assemble import assemble
 from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
-from bake_core.convergence import Point, Verdict, decide, fit_pass, next_pass
+from bake_core.convergence import Point, decide, fit_pass, next_pass
 from bake_core.environment import Find, no_images, read_environment
-from bake_core.errors import MachineError
+from bake_core.errors import Cancelled, MachineError
 from bake_core.filtering import visibility_moments
 from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
+from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
 from bake_core.selection import Selection, select
@@ -119,6 +120,7 @@ def empty_state(prepared: Prepared) -> State:
             backface=np.zeros(n, np.float32),
             distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
             normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
+            rays=0,
         )
     except MemoryError:
         raise MachineError(
@@ -155,11 +157,11 @@ def trace_shard(
     positions = np.ascontiguousarray(prepared.positions[slice(*probes)])
     ids = np.arange(*probes, dtype=np.uint64)
     capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
-    irradiance, radiance = capture_radiance(
+    irradiance, radiance, rays = capture_radiance(
         prepared.tracer, positions, ids, samples, capture, threads=threads, cancelled=flag, advance=advance
     )
     empty = np.zeros
-    seen = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else {}
+    seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else ({}, 0)
     return Tally(
         *probes,
         *samples,
@@ -169,6 +171,7 @@ def trace_shard(
         backface=seen.get("backface", empty(0, np.float32)),
         distance=seen.get("distance", empty((0, 0), np.float32)),
         normal=seen.get("normal", empty((0, 0, 0), np.float32)),
+        rays=rays + looked,
     )
 
 
@@ -179,14 +182,14 @@ def compile_kernels(prepared: Prepared) -> None:
 
 def _see(
     prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], threads: int, flag: NDArray[np.uint8]
-) -> dict[str, NDArray[np.float32]]:
-    """Distances and what is made of them, a few probes at a time on each thread."""
+) -> tuple[dict[str, NDArray[np.float32]], int]:
+    """Distances and what is made of them, a few probes at a time on each thread; and how many rays they took."""
     s = prepared.selection
     solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
 
-    def look(first: int) -> dict[str, NDArray[np.float32]]:
+    def look(first: int) -> tuple[dict[str, NDArray[np.float32]], int]:
         chunk = slice(first, first + _DISTANCE_CHUNK)
-        distance, normal, back = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
+        distance, normal, back, rays = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
         # One row at a time: a matrix product's bits may depend on how many rows it has.
         seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
         if s.keeps("visibility"):
@@ -195,25 +198,14 @@ def _see(
             seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
         if s.keeps("normal"):
             if s.normal != s.distance:
-                _, normal, _ = capture_distance(prepared.tracer, positions[chunk], s.normal, cancelled=flag)
+                _, normal, _, more = capture_distance(prepared.tracer, positions[chunk], s.normal, cancelled=flag)
+                rays += more
             seen["normal"] = normal
-        return seen
+        return seen, rays
 
     with ThreadPoolExecutor(threads) as pool:
-        parts = list(pool.map(look, range(0, max(len(positions), 1), _DISTANCE_CHUNK)))
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-@dataclass
-class Run:
-    """What happened in time: goes into the report, never into the manifest."""
-
-    threads: int
-    shards: int
-    curve: list[Point] = field(default_factory=list)
-    stopped: Verdict = "continue"
-    seconds: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
+        parts, counts = zip(*pool.map(look, range(0, max(len(positions), 1), _DISTANCE_CHUNK)), strict=True)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, sum(counts)
 
 
 def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, Any]:
@@ -237,7 +229,7 @@ def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, A
             manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)
-            report.write(work, manifest, bundle.content_digest(written), asdict(run))
+            report.write(work, manifest, bundle.content_digest(written), run)
             bundle.publish(work, out)
     except OSError as e:
         raise MachineError("machine.cannot_write", f"{e.strerror or e}; is there room on the disk?", str(out)) from e
@@ -262,6 +254,7 @@ def bake(
     shards: int = 1,
     find: Find = no_images,
     progress: ProgressCallback | None = None,
+    point: Callable[[Point], None] = lambda point: None,
     cancelled: NDArray[np.uint8] | None = None,
 ) -> BakeResult:
     """Bake here and now.
@@ -276,12 +269,17 @@ def bake(
         How the work is split; the bundle does not depend on it.
     find : callable, optional
         Where an image that the spec names lies.
+    point : callable, optional
+        Told each point of the curve of error against time as it is measured.
+    cancelled : (1,) uint8, optional
+        Set it to 1 from any thread: tracing stops within a texel, and what whole passes have gathered is written.
 
     Raises
     ------
     InputError
         Nothing was written.
     Cancelled
+        Before the first pass was whole: nothing was written.
     """
     out = Path(out).absolute()
     bundle.check_replaceable(out)
@@ -293,7 +291,7 @@ def bake(
     clock.stage("compiling")
     compile_kernels(prepared)
     clock.stage("tracing")
-    state, run = empty_state(prepared), Run(threads, shards)
+    state, run = empty_state(prepared), Run(threads, shards, began=clock.elapsed)
     ranges = shard_ranges(prepared.probe_count, shards)
     while run.stopped == "continue":
         samples = fit_pass(spec.stop, next_pass(spec.stop, state.samples), run.curve, clock.elapsed)
@@ -301,18 +299,26 @@ def bake(
             run.stopped = "time"
             break
         clock.begin(samples, len(ranges))
-        state.add([trace_shard(prepared, r, samples, threads=threads, cancelled=cancelled, advance=clock.advance) for r in ranges])
+        try:
+            tallies = [trace_shard(prepared, r, samples, threads=threads, cancelled=cancelled, advance=clock.advance) for r in ranges]
+        except Cancelled:
+            if not run.curve:
+                raise
+            run.stopped = "interrupt"
+            break
+        state.add(tallies)
         error, seconds = state.error(), clock.elapsed
-        run.curve.append(Point(state.samples, seconds, error))
+        run.curve.append(Point(state.samples, state.rays, seconds, error))
+        point(run.curve[-1])
         clock.measured(state.samples, error)
         run.stopped = decide(spec.stop, state.samples, error, seconds)
     clock.stage("writing")
     run.seconds, run.stages = clock.elapsed, clock.stages()
     manifest = finish(prepared, state, run, out)
-    return BakeResult(manifest, run, met(spec, run.curve))
+    return BakeResult(manifest, run, met(spec, run))
 
 
-def met(spec: Spec, curve: Sequence[Point]) -> bool:
-    """Whether a bake got what it was asked for: its target error, where there was one."""
-    target, error = spec.stop.target_error, curve[-1].error
-    return target is None or (error is not None and error <= target)
+def met(spec: Spec, run: Run) -> bool:
+    """Whether a bake got what it was asked for: its target error where there was one, and nobody stopped it."""
+    target, error = spec.stop.target_error, run.curve[-1].error
+    return run.stopped != "interrupt" and (target is None or (error is not None and error <= target))

@@ -218,7 +218,7 @@ def publish(folder: Path, out: Path) -> None:
             out.replace(old)
             try:
                 folder.replace(out)
-            except OSError:
+            except BaseException:  # Ctrl-C as well
                 old.replace(out)
                 raise
             shutil.rmtree(old)

@@ -16,7 +16,7 @@ import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
-from bake_core.embree import intersect1, new_rayhit, set_ray
+from bake_core.embree import intersect1, new_rayhit, rays_traced, set_ray
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import either, entry_kernel, kernel
@@ -287,7 +287,7 @@ def capture_radiance(
     threads: int,
     cancelled: NDArray[np.uint8],
     advance: Callable[[float], None],
-) -> tuple[F64, F64]:
+) -> tuple[F64, F64, int]:
     """Sums over a range of samples for some probes, on several threads.
 
     Parameters
@@ -309,6 +309,8 @@ def capture_radiance(
         Sums; over the samples of a scramble they give irradiance, no 1/π inside.
     radiance : (p, resolution², 3) float64
         Sums over all samples; (0, 0, 0) unless it is kept.
+    rays : int
+        Traced for them: through texels, on from surfaces, towards light.
 
     Raises
     ------
@@ -319,11 +321,12 @@ def capture_radiance(
     irradiance = np.zeros((n, SCRAMBLES, normals.shape[1], 3))
     radiance = np.zeros((n, capture.resolution**2, 3) if capture.keep_radiance else (0, 0, 0))
 
-    def trace(first: int, end: int, blocks: tuple[int, int]) -> F64:
+    def trace(first: int, end: int, blocks: tuple[int, int]) -> tuple[F64, int]:
+        ray = new_rayhit()
         sums = np.zeros((end - first, BLOCKS, *irradiance.shape[1:]))
         status = _capture_kernel(
             tracer.tables,
-            new_rayhit(),
+            ray,
             positions[first:end],
             ids[first:end],
             *samples,
@@ -339,28 +342,31 @@ def capture_radiance(
         )
         if status == _CANCELLED:
             raise Cancelled
-        return sums
+        return sums, rays_traced(ray)
 
-    def trace_probes(first: int, end: int) -> None:
-        irradiance[first:end] = _sum_blocks(trace(first, end, (0, BLOCKS)))
+    def trace_probes(first: int, end: int) -> int:
+        sums, rays = trace(first, end, (0, BLOCKS))
+        irradiance[first:end] = _sum_blocks(sums)
         advance((end - first) / n)
+        return rays
 
-    def trace_block(block: int) -> F64:
-        sums = trace(0, n, (block, block + 1))
+    def trace_block(block: int) -> tuple[F64, int]:
+        sums, rays = trace(0, n, (block, block + 1))
         advance(1 / BLOCKS)
-        return sums[:, block]
+        return sums[:, block], rays
 
     with ThreadPoolExecutor(threads) as pool:
         if n < 4 * threads:
             # Too few probes to share out: share each probe's blocks.
-            irradiance[:] = _sum_blocks(np.stack(list(pool.map(trace_block, range(BLOCKS))), 1))
+            blocks, counts = zip(*pool.map(trace_block, range(BLOCKS)), strict=True)
+            irradiance[:] = _sum_blocks(np.stack(blocks, 1))
+            rays = sum(counts)
         else:
             # Small enough that threads end together, large enough that Python's part is nothing.
             step = max(1, min(n // (32 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(samples[1] - samples[0], 1))))
             starts = range(0, n, step)
-            for _ in pool.map(lambda first: trace_probes(first, min(first + step, n)), starts):
-                pass
-    return irradiance, radiance
+            rays = sum(pool.map(lambda first: trace_probes(first, min(first + step, n)), starts))
+    return irradiance, radiance, rays
 
 
 @cache
@@ -381,7 +387,7 @@ def _sum_blocks(sums: F64) -> F64:
 
 def capture_distance(
     tracer: Tracer, positions: F64, resolution: int, *, cancelled: NDArray[np.uint8]
-) -> tuple[F64, F32, NDArray[np.bool_]]:
+) -> tuple[F64, F32, NDArray[np.bool_], int]:
     """Distances, normals and back faces through texel centres; releases the GIL.
 
     Parameters
@@ -400,6 +406,8 @@ def capture_distance(
         Geometric, unit, towards the probe; zeros for a miss.
     back : (p, resolution²) bool
         Back face of a single-sided surface.
+    rays : int
+        Traced for them.
 
     Raises
     ------
@@ -409,6 +417,7 @@ def capture_distance(
     n = len(directions)
     distance, normal = np.empty((len(positions), n)), np.empty((len(positions), n, 3), np.float32)
     back = np.empty((len(positions), n), np.bool_)
-    if _distance_kernel(tracer.tables, new_rayhit(), positions, directions, cancelled, distance, normal, back) == _CANCELLED:
+    ray = new_rayhit()
+    if _distance_kernel(tracer.tables, ray, positions, directions, cancelled, distance, normal, back) == _CANCELLED:
         raise Cancelled
-    return distance, normal, back
+    return distance, normal, back, rays_traced(ray)

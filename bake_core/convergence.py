@@ -29,17 +29,27 @@ FIRST_SAMPLES = 16
 # A pass that a time limit shortens is a multiple of this: each scramble gets as many samples.
 SMALLEST_PASS = 4
 
-Verdict = Literal["continue", "target", "samples", "time"]
+Verdict = Literal["continue", "target", "samples", "time", "interrupt"]
 
 
 @dataclass(frozen=True)
 class Point:
-    """One point of a job's curve of error against run time.
+    """One point of a job's curve of error against run time: what there is at the end of a pass.
 
-    `error` is None where it cannot be measured (fewer samples than scrambles).
+    Attributes
+    ----------
+    samples : int
+        Of each capture texel, so far.
+    rays : int
+        Traced so far, of whatever kind: through texels, on from surfaces, towards light, for distances.
+    seconds : float
+        Since the bake began.
+    error : float or None
+        None where it cannot be measured (fewer samples than scrambles).
     """
 
     samples: int
+    rays: int
     seconds: float
     error: float | None
 
@@ -68,7 +78,7 @@ def fit_pass(stop: Stop, samples: tuple[int, int], curve: Sequence[Point], secon
     """
     if stop.max_seconds is None or not curve:
         return samples
-    before = curve[-2] if len(curve) > 1 else Point(0, 0.0, None)
+    before = curve[-2] if len(curve) > 1 else Point(0, 0, 0.0, None)
     per_sample = (curve[-1].seconds - before.seconds) / (curve[-1].samples - before.samples)
     fitting = int(max(stop.max_seconds - seconds, 0) / max(per_sample, 1e-9)) // SMALLEST_PASS * SMALLEST_PASS
     return samples[0], samples[0] + min(samples[1] - samples[0], fitting)

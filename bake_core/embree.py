@@ -24,8 +24,9 @@ from bake_core.scene import Scene
 
 # RTCRayHit of Embree 4.4 as embreex builds it (RTC_MAX_INSTANCE_LEVEL_COUNT 1, instPrimID compiled in), in 4-byte words:
 #  0-2 origin, 3 tnear, 4-6 direction, 7 time, 8 tfar, 9 mask, 10 id, 11 flags, 12-14 Ng, 15-16 u v, 17 primID, 18 geomID, 19 instID, 20
-#  instPrimID
+#  instPrimID; 21-23 fill the structure up. Embree leaves them alone, so the number of rays is counted in the last two.
 RAYHIT_WORDS = 24
+_COUNT_LOW, _COUNT_HIGH = 22, 23
 # Rays are 16-byte aligned; a cache line keeps a ray from straddling two.
 RAYHIT_ALIGNMENT = 64
 INVALID_ID = np.uint32(0xFFFFFFFF)
@@ -104,9 +105,15 @@ def new_rayhit() -> NDArray[np.float32]:
     return raw[start : start + RAYHIT_WORDS * 4].view(np.float32)
 
 
+def rays_traced(ray: NDArray[np.float32]) -> int:
+    """How many rays have gone out of this RTCRayHit since it was new; each was filled by :func:`set_ray`."""
+    words = ray.view(np.uint32)
+    return int(words[_COUNT_LOW]) + (int(words[_COUNT_HIGH]) << 32)
+
+
 @kernel
 def set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
-    """Fill a ray for either query; `ray_bits` is the same memory seen as uint32."""
+    """Fill a ray for either query, and count it; `ray_bits` is the same memory seen as uint32."""
     ray[0], ray[1], ray[2], ray[3] = ox, oy, oz, np.float32(0)
     ray[4], ray[5], ray[6], ray[7] = dx, dy, dz, np.float32(0)
     ray[8] = tfar
@@ -115,6 +122,9 @@ def set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-unt
     ray_bits[11] = np.uint32(0)
     ray_bits[18] = np.uint32(0xFFFFFFFF)
     ray_bits[19] = np.uint32(0xFFFFFFFF)
+    ray_bits[_COUNT_LOW] += np.uint32(1)
+    if ray_bits[_COUNT_LOW] == 0:
+        ray_bits[_COUNT_HIGH] += np.uint32(1)
 
 
 class Geometry:

@@ -13,6 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from bake_core.drawing import Drawing, lines_as_pixels
 from bake_core.errors import BakeError, InputError
 
 F32 = NDArray[np.float32]
@@ -24,6 +25,8 @@ _RADIANCES = {b"\x76\x2f\x31\x01": ".exr", b"#?": ".hdr"}
 # An 8192 × 4096 sky: 400 MB as float32 RGB.
 _MAX_RADIANCE_TEXELS = 1 << 25
 
+# One of those in OpenImageIO's wheel; it has ±, but neither a minus sign of its own nor superscripts.
+_FONT = "DroidSans"
 # EXR files carry a date; a fixed one keeps them the same bytes for the same texels.
 _DATE = "2000:01:01 00:00:00"
 
@@ -56,6 +59,18 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write an 8-bit RGB PNG, (height, width, 3)."""
     height, width, depth = pixels.shape
     _write(path, pixels, oiio.ImageSpec(width, height, depth, "uint8"))
+
+
+def write_drawing(path: Path, drawing: Drawing) -> None:
+    """Write a drawing as an 8-bit PNG, its words in the sans-serif that OpenImageIO brings along."""
+    image = oiio.ImageBuf(np.ascontiguousarray(lines_as_pixels(drawing), np.float32))
+    for t in drawing.texts:
+        x, y = (round(a) for a in t.place)
+        box = oiio.ImageBufAlgo.text_size(t.words, round(t.size), _FONT)
+        x -= {"start": 0, "middle": (box.xend - box.xbegin) // 2, "end": box.xend - box.xbegin}[t.anchor]
+        if not oiio.ImageBufAlgo.render_text(image, x, y, t.words, round(t.size), _FONT, tuple(c / 255 for c in t.colour)):
+            raise BakeError("bake.cannot_write", image.geterror() or "has words that cannot be drawn", str(path))
+    write_png(path, np.rint(255 * np.asarray(image.get_pixels(oiio.FLOAT))).astype(np.uint8))
 
 
 def _write(path: Path, pixels: NDArray[np.generic], spec: oiio.ImageSpec) -> None:

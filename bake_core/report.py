@@ -1,18 +1,47 @@
-"""The report of a bake: everything that was measured in time, as JSON for programs and as a page for people."""
+"""The report of a bake: everything that was measured in time, as JSON for programs, as a page and as a plot for people."""
 
 from __future__ import annotations
 
 import html
 import os
 import platform
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bake_core.bundle import dump_json
+from bake_core.convergence import Point, Verdict
+from bake_core.drawing import as_svg
+from bake_core.error_plot import error_plot
+from bake_core.images import write_drawing
+from bake_core.rate import Rate, in_words, rate_by_samples, rate_by_seconds
 
 
-def write(folder: Path, manifest: dict[str, Any], digest: str, run: dict[str, Any]) -> None:
-    """Write ``report.json`` and ``report.html``.
+@dataclass
+class Run:
+    """What happened in time: goes into the report, never into the manifest.
+
+    Attributes
+    ----------
+    began : float or None
+        Seconds before the first ray; None where the bake was resumed, for then its seconds have a gap.
+    """
+
+    threads: int
+    shards: int
+    began: float | None = None
+    curve: list[Point] = field(default_factory=list)
+    stopped: Verdict = "continue"
+    seconds: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+
+    def rates(self) -> tuple[Rate, Rate | None]:
+        """How fast the error fell, against samples and against seconds of tracing."""
+        return rate_by_samples(self.curve), None if self.began is None else rate_by_seconds(self.curve, self.began)
+
+
+def write(folder: Path, manifest: dict[str, Any], digest: str, run: Run) -> None:
+    """Write ``report.json``, ``report.html``, ``report.svg`` and ``report.png``.
 
     Parameters
     ----------
@@ -21,9 +50,9 @@ def write(folder: Path, manifest: dict[str, Any], digest: str, run: dict[str, An
     manifest : dict
     digest : str
         The bundle's content digest.
-    run : dict
-        threads, shards, curve (samples, seconds, error), stopped, seconds, stages.
+    run : Run
     """
+    by_samples, by_seconds = run.rates()
     document = {
         "content_digest": digest,
         "generator": manifest["generator"],
@@ -31,10 +60,20 @@ def write(folder: Path, manifest: dict[str, Any], digest: str, run: dict[str, An
         "machine": {"cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()},
         "error": manifest["error"],
         "samples": manifest["samples"],
-        **run,
+        **asdict(run),
+        "rate": rate_json(run),
     }
+    plot = error_plot(run.curve, manifest["error"]["target"], by_samples, by_seconds, run.began)
     (folder / "report.json").write_bytes(dump_json(document))
-    (folder / "report.html").write_text(_page(manifest, document), encoding="utf-8")
+    (folder / "report.svg").write_text(as_svg(plot), encoding="utf-8")
+    write_drawing(folder / "report.png", plot)
+    (folder / "report.html").write_text(_page(manifest, document, run, as_svg(plot)), encoding="utf-8")
+
+
+def rate_json(run: Run) -> dict[str, Any]:
+    """Both rates as ``report.json`` has them: null for seconds that have a gap."""
+    by_samples, by_seconds = run.rates()
+    return {"samples": asdict(by_samples), "seconds": None if by_seconds is None else asdict(by_seconds)}
 
 
 def percent(error: float | None) -> str:
@@ -42,7 +81,7 @@ def percent(error: float | None) -> str:
     return "–" if error is None else f"{100 * error:.2f} %"
 
 
-def _page(manifest: dict[str, Any], document: dict[str, Any]) -> str:
+def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: str) -> str:
     probes = sum(v["probes"]["count"] for v in manifest["volumes"])
     active = sum(v["probes"]["active"] for v in manifest["volumes"])
     facts = {
@@ -57,15 +96,19 @@ def _page(manifest: dict[str, Any], document: dict[str, Any]) -> str:
     atlases = [
         (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"]) for v in manifest["volumes"] for a in v["atlases"]
     ]
-    curve = [(p["samples"], f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
+    curve = [(p["samples"], f"{p['rays']:,}", f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
+    fitted = [(f"against {name}", in_words(rate)) for name, rate in zip(("samples", "seconds of tracing"), run.rates(), strict=True)]
     left_out = [(x["what"], x["why"]) for x in manifest["left_out"]]
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>octobake report</title>"
         "<style>body{font:16px system-ui;max-width:60rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse;margin:1rem 0}"
-        "td,th{padding:.2rem .8rem;border-bottom:1px solid #ccc;text-align:left}</style><h1>Bake report</h1>"
+        "td,th{padding:.2rem .8rem;border-bottom:1px solid #ccc;text-align:left}svg{max-width:100%;height:auto}</style><h1>Bake report</h1>"
         + _table((), facts.items())
         + "<h2>Error against time</h2>"
-        + _table(("samples", "seconds", "error"), curve)
+        + plot
+        + _table(("samples", "rays", "seconds", "error"), curve)
+        + "<p>How fast the error falls: the slope of its logarithm, and its standard error. Independent samples have -0.5.</p>"
+        + _table((), fitted)
         + "<h2>Atlases</h2>"
         + _table(("volume", "output", "stored as", "cost of storing", "file"), atlases)
         + "<h2>Left out</h2>"

@@ -54,6 +54,8 @@ class Tally(_Bytes):
     backface : (p,) float32
     distance : (p, d²) float32 or (0, 0)
     normal : (p, n², 3) float32 or (0, 0, 0)
+    rays : int
+        Traced for all of it.
     """
 
     first_probe: int
@@ -66,6 +68,7 @@ class Tally(_Bytes):
     backface: F32
     distance: F32
     normal: F32
+    rays: int
 
 
 @dataclass
@@ -79,6 +82,7 @@ class State(_Bytes):
     backface: F32
     distance: F32
     normal: F32
+    rays: int
 
     def add(self, tallies: Sequence[Tally]) -> None:
         """Add one whole pass.
@@ -99,6 +103,7 @@ class State(_Bytes):
         for t in ordered:
             probes = slice(t.first_probe, t.end_probe)
             self.irradiance[probes] += t.irradiance
+            self.rays += t.rays
             if self.radiance.size:
                 self.radiance[probes] += t.radiance
             if first == 0:

@@ -124,9 +124,10 @@ class Progress(BaseModel):
 class Point(BaseModel):
     """A point on a bake's curve of error against time."""
 
-    samples: int
-    error: float | None
-    seconds: float
+    samples: int = Field(description="Per capture texel, so far.")
+    rays: int = Field(description="Traced so far, of whatever kind.")
+    seconds: float = Field(description="Since the bake began.")
+    error: float | None = Field(description="Relative RMS, 95 % upper bound.")
 
 
 class JobError(BaseModel):

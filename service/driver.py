@@ -19,9 +19,10 @@ from distributed.client import FutureCancelledError
 
 from bake_core import bake
 from bake_core.clock import Clock
-from bake_core.convergence import Point, decide, fit_pass, next_pass
+from bake_core.convergence import decide, fit_pass, next_pass
 from bake_core.errors import BakeError, OctobakeError
 from bake_core.progress import Progress
+from bake_core.report import Run
 from bake_core.spec import Spec, parse_spec
 from service import worker
 from service.blobs import Blobs
@@ -136,7 +137,7 @@ class Driver:
         clock.stage("compiling")
         self._one(worker.compile_kernels, work)
         clock.stage("tracing")
-        run = bake.Run(threads, 1, curve=[Point(p.last, _seconds(p), p.error) for p in merged])
+        run = Run(threads, 1, None if passes else self._seconds(), [p.point for p in merged])
         if merged:
             clock.measured(merged[-1].last, merged[-1].error)
             run.stopped = decide(spec.stop, merged[-1].last, merged[-1].error, self._seconds_before)
@@ -148,7 +149,7 @@ class Driver:
             done = self._trace(work, following, probes, merged[-1].state if merged else None, clock)
             merged.append(done)
             run.shards = done.shards
-            run.curve.append(Point(done.last, _seconds(done), done.error))
+            run.curve.append(done.point)
             run.stopped = decide(spec.stop, done.last, done.error, _seconds(done))
 
         self._move(State.FINALIZING)
@@ -163,12 +164,12 @@ class Driver:
             "error": merged[-1].error,
             "seconds": self._seconds(),
             "stopped": run.stopped,
-            "exit_code": 0 if bake.met(spec, run.curve) else 4,
+            "exit_code": 0 if bake.met(spec, run) else 4,
         }
         last = Progress("writing", 1.0, merged[-1].last, merged[-1].error, self._seconds(), 0.0)
         self._move(State.SUCCEEDED, result=result, progress=asdict(last))
 
-    def _open_pass(self, spec: Spec, merged: list[Pass], run: bake.Run, probes: int) -> Pass | None:
+    def _open_pass(self, spec: Spec, merged: list[Pass], run: Run, probes: int) -> Pass | None:
         """The next pass, or None where the time that is left has no room for one."""
         samples = merged[-1].last if merged else 0
         first, last = fit_pass(spec.stop, next_pass(spec.stop, samples), run.curve, self._seconds())
@@ -200,8 +201,8 @@ class Driver:
             clock.advance(1.0)
         self._run([piece(i) for i in range(opened.shards) if i not in tallies], clock.advance)
         references = [tallies[i] for i in range(opened.shards)]
-        state, error = self._one(worker.merge, work, f"state-{opened.index}", state, references)
-        done = replace(opened, state=state, error=error, seconds=self._seconds())
+        state, error, rays = self._one(worker.merge, work, f"state-{opened.index}", state, references)
+        done = replace(opened, state=state, error=error, seconds=self._seconds(), rays=rays)
         clock.measured(done.last, error)
         self._store.commit_pass(self.job.id, done, self._shown or {})
         self._hub.tell(self.job.id)

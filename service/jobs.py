@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from bake_core.convergence import Point
 from bake_core.errors import OctobakeError
 
 
@@ -115,6 +116,13 @@ class Pass:
     state: str | None
     error: float | None
     seconds: float | None
+    rays: int | None
+
+    @property
+    def point(self) -> Point:
+        """What a merged pass adds to the curve."""
+        assert self.rays is not None and self.seconds is not None
+        return Point(self.last, self.rays, self.seconds, self.error)
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,8 @@ passes = sa.Table(
     sa.Column("state", sa.Text),
     sa.Column("error", sa.Double),
     sa.Column("seconds", sa.Double),
+    # Of all passes up to this one.
+    sa.Column("rays", sa.BigInteger),
 )
 shards = sa.Table(
     "shards",
@@ -225,7 +227,7 @@ class Store:
         """Open a pass; its division into shards is fixed from here on, so that a restart can resume it."""
         with self._write() as c:
             c.execute(sa.insert(passes).values({"job": job, "index": index, "first": first, "last": last, "shards": pieces}))
-        return Pass(index, first, last, pieces, None, None, None)
+        return Pass(index, first, last, pieces, None, None, None, None)
 
     def commit_shard(self, job: str, pass_index: int, index: int, tally: str, seconds: float) -> None:
         """Record a shard's sums, once: whoever comes second is dropped, for its bytes are the same."""
@@ -239,9 +241,9 @@ class Store:
         """Record a pass that is merged, its point on the error curve and the job's progress."""
         with self._write() as c:
             key = (passes.c.job == job) & (passes.c.index == done.index)
-            c.execute(sa.update(passes).where(key).values(state=done.state, error=done.error, seconds=done.seconds))
+            c.execute(sa.update(passes).where(key).values(state=done.state, error=done.error, seconds=done.seconds, rays=done.rays))
             c.execute(sa.update(jobs).where(jobs.c.id == job).values(progress=dict(progress)))
-            _add_event(c, job, "pass", {"samples": done.last, "error": done.error, "seconds": done.seconds})
+            _add_event(c, job, "pass", {"samples": done.last, "rays": done.rays, "seconds": done.seconds, "error": done.error})
 
     def passes(self, job: str) -> list[Pass]:
         """A bake's passes in order."""

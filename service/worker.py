@@ -27,6 +27,7 @@ from bake_core import bake, verification
 from bake_core.bundle import read_bundle
 from bake_core.cameras import parse_cameras
 from bake_core.progress import Progress
+from bake_core.report import Run
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
@@ -91,16 +92,16 @@ def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, in
         return _blobs(work.store).put_work(work.job, name, tally.to_bytes()), seconds
 
 
-def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> tuple[str, float | None]:
-    """Add a whole pass to the sums before it; answers where the new ones are stored, and their error."""
+def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> tuple[str, float | None, int]:
+    """Add a whole pass to the sums before it; answers where the new ones are stored, their error, and how many rays there were in all."""
     with _task():
         blobs = _blobs(work.store)
         sums = _state(work, state)
         sums.add([Tally.from_bytes(blobs.get_work(work.job, tally)) for tally in tallies])
-        return blobs.put_work(work.job, name, sums.to_bytes()), sums.error()
+        return blobs.put_work(work.job, name, sums.to_bytes()), sums.error(), sums.rays
 
 
-def finish(work: Work, state: str, run: bake.Run) -> dict[str, Any]:
+def finish(work: Work, state: str, run: Run) -> dict[str, Any]:
     """Filter, encode and pack; answers the digests and sizes of the bundle and of its report."""
     with _task(), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 
@@ -31,13 +32,13 @@ def positive(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Bake; 4 where the target error was not reached."""
+    """Bake; 4 where the target error was not reached, or somebody stopped it before."""
     import numpy as np
 
     from bake_core import bundle
     from bake_core.bake import bake
     from bake_core.environment import beside
-    from bake_core.report import percent
+    from bake_core.report import percent, rate_json
     from bake_core.spec import load_spec
     from service.cli.progress import ProgressLine
 
@@ -47,8 +48,9 @@ def run(args: argparse.Namespace) -> int:
 
     def stop(signum: int, frame: FrameType | None) -> None:
         stage = line.last.stage if line.last else ""
-        if stage in ("tracing", "writing"):
-            # Kernels run without the GIL and only look at this flag: Ctrl-C ends a bake within a texel. A bundle is written whole.
+        if stage in ("tracing", "writing") and not cancelled[0]:
+            # Kernels run without the GIL and only look at this flag: Ctrl-C ends tracing within a texel. What whole passes have
+            # gathered is written then, unless a second one comes.
             cancelled.fill(1)
         elif stage == "compiling":
             # It may take a minute in a thread that nothing else stops, and there is no file yet to clear away.
@@ -58,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             signal.default_int_handler(signum, frame)
 
-    previous = signal.signal(signal.SIGINT, stop)
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         result = bake(
             args.scene,
@@ -68,11 +70,13 @@ def run(args: argparse.Namespace) -> int:
             shards=args.shards,
             find=beside(args.spec.parent),
             progress=line,
+            point=line.point,
             cancelled=cancelled,
         )
     finally:
         line.close()
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     manifest, done = result.manifest, result.run
     error, probes = manifest["error"]["value"], sum(v["probes"]["count"] for v in manifest["volumes"])
     if args.json:
@@ -85,16 +89,18 @@ def run(args: argparse.Namespace) -> int:
             "target_error": spec.stop.target_error,
             "stopped": manifest["stopped"],
             "seconds": done.seconds,
-            "curve": [{"samples": p.samples, "seconds": p.seconds, "error": p.error} for p in done.curve],
+            "curve": [asdict(p) for p in done.curve],
+            "rate": rate_json(done),
         }
         print(json.dumps(document, indent=2))
     else:
         print(f"{args.out}: {probes} probes, {manifest['samples']} samples, error {percent(error)}, {done.seconds:.1f} s")
-    if not result.met:
+    if done.stopped == "interrupt":
+        print(f"octobake: interrupted; the bundle holds what {manifest['samples']} samples gave", file=sys.stderr)
+    elif not result.met:
         print(
             f"octobake: stopped by {manifest['stopped']} at error {percent(error)}, above the target of {percent(spec.stop.target_error)}; "
             "raise stop.max_samples or stop.max_seconds",
             file=sys.stderr,
         )
-        return 4
-    return 0
+    return 0 if result.met else 4

@@ -29,7 +29,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
+    from bake_core.rate import Rate, in_words
     from bake_core.report import percent
+    from service.cli.progress import count
 
     error = manifest["error"]
     size = sum(f["bytes"] for f in manifest["files"].values())
@@ -51,6 +53,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
     lines += [f"left out   {x['what']}: {x['why']}" for x in manifest["left_out"]]
     lines += [f"ignored    {line}" for line in manifest["scene"]["ignored"]]
     if report is not None:
-        lines += ["", f"{'samples':>9}{'seconds':>10}{'error':>10}"]
-        lines += [f"{p['samples']:>9}{p['seconds']:>10.2f}{percent(p['error']):>10}" for p in report["curve"]]
+        lines += ["", f"{'samples':>9}{'rays':>9}{'seconds':>10}{'error':>10}"]
+        lines += [f"{p['samples']:>9}{count(p['rays']):>9}{p['seconds']:>10.2f}{percent(p['error']):>10}" for p in report["curve"]]
+        rates = {name: rate and Rate(**rate) for name, rate in report["rate"].items()}
+        lines += ["", *(f"rate       {in_words(rate)}, against {name}" for name, rate in rates.items())]
     return lines

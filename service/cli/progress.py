@@ -6,9 +6,13 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from bake_core.progress import Progress
+
+if TYPE_CHECKING:
+    # It loads numpy, which commands that bake nothing do without.
+    from bake_core.convergence import Point
 
 # A terminal line redrawn faster than this only flickers; a log needs a line no oftener than this to show that work goes on.
 TERMINAL_INTERVAL = 0.1
@@ -38,11 +42,19 @@ class ProgressLine:
     def __call__(self, progress: Progress) -> None:
         """Take one report; draws it if enough time has passed or something other than the fraction has changed."""
         before, self.last = self._drawn, progress
-        # A new error figure or stage is news at once; a growing fraction is news only now and then.
-        news = before is None or (before.stage, before.samples) != (progress.stage, progress.samples)
+        # A new stage is news at once; a growing fraction is news only now and then.
+        news = before is None or before.stage != progress.stage
         interval = TERMINAL_INTERVAL if self.terminal else LOG_INTERVAL
         if news or time.monotonic() - self._drawn_at >= interval:
             self._draw(progress)
+
+    def point(self, point: Point) -> None:
+        """Print a new point of the curve of error against time; it stays, above the line that is redrawn."""
+        clear = "\r\x1b[K" if self.terminal else ""
+        self.stream.write(f"{clear}{self.label}{describe_point(point)}\n")
+        self.stream.flush()
+        if self.terminal and self._drawn is not None:
+            self._draw(self._drawn)
 
     def close(self) -> None:
         """Draw the last report if it was held back, and end the line."""
@@ -79,6 +91,12 @@ def describe(progress: Progress) -> str:
     return ", ".join(parts)
 
 
+def describe_point(point: Point) -> str:
+    """A point of the curve in words: ``pass done: 64 samples, 3.1 M rays, 12 s, error 3.1 %``."""
+    error = "error unknown" if point.error is None else f"error {percent(point.error)}"
+    return f"pass done: {point.samples} samples, {count(point.rays)} rays, {duration(point.seconds)}, {error}"
+
+
 def describe_result(result: Mapping[str, Any]) -> str:
     """What came of a bake: ``64 samples, error 1.3 %, 6.2 s, stopped at its target``."""
     reasons = {"target": "stopped at its target", "samples": "stopped at its samples", "time": "stopped at its time"}
@@ -105,6 +123,14 @@ def describe_job(job: Mapping[str, Any]) -> str:
 def percent(error: float) -> str:
     """An error as a percentage with two significant digits, since its own uncertainty is of that order."""
     return f"{error * 100:.2g} %" if error < 1 else f"{error * 100:.0f} %"
+
+
+def count(n: int) -> str:
+    """A large number with two or three digits: ``940``, ``12 k``, ``3.1 M``, ``5.0 G``."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if n >= size:
+            return f"{n / size:.{1 if n < 10 * size else 0}f} {letter}"
+    return str(n)
 
 
 def duration(seconds: float) -> str:

@@ -15,6 +15,7 @@ from service.cli.progress import ProgressLine
 if TYPE_CHECKING:
     # The client's HTTP library takes longer to load than `octobake --help` should.
     from octobake_client import Bake, Client, Job, Verification
+    from octobake_client import Point as CurvePoint
     from octobake_client import Progress as Told
 
 DEFAULT_SERVER = "http://127.0.0.1:8787"
@@ -52,13 +53,18 @@ def connect(server: str) -> Iterator[Client]:
 
 def follow(client: Client, job: AnyJob) -> AnyJob:
     """Wait for a job with a progress line; raises unless it succeeds."""
+    from bake_core.convergence import Point
+
     line = ProgressLine(label=job.id)
 
     def show(told: Told) -> None:
         line(Progress(told.stage, told.fraction, told.samples, told.error, told.seconds, told.eta))
 
+    def measured(told: CurvePoint) -> None:
+        line.point(Point(told.samples, told.rays, told.seconds, told.error))
+
     try:
-        return client.wait(job, show).check()
+        return client.wait(job, show, measured).check()
     finally:
         line.close()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from fastapi import APIRouter, Request, Response
 
 from bake_core.placement import place
@@ -27,7 +29,7 @@ def _document(service: Service, job: Job, brief: bool) -> documents.Bake:
         **documents.common(job, service.hub.progress(job.id), PATH, *made),
         scene=job.request["scene"],
         spec=job.request["spec"],
-        curve=[documents.Point(samples=p.last, error=p.error, seconds=p.seconds or 0.0) for p in passes],
+        curve=[documents.Point(**asdict(p.point)) for p in passes],
         result=job.result,
     )
 

@@ -20,7 +20,7 @@ function row(bake) {
   const bar = document.createElement("progress");
   bar.value = bake.state === "succeeded" ? 1 : bake.progress?.fraction ?? 0;
   const error = bake.progress?.error;
-  cell(tr, link(bake.links.self, bake.id));
+  cell(tr, link(`/web/bakes/${bake.id}`, bake.id));
   cell(tr, bake.error ? `${bake.state}: ${bake.error.slug}` : bake.state);
   cell(tr, bar);
   cell(tr, bake.progress?.samples ?? "");

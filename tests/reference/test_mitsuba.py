@@ -64,7 +64,7 @@ def bake(peers: Path, folder: Path, name: str, samples: int, chosen: NDArray[np.
     flag = np.zeros(1, np.uint8)
     out = np.empty((SEEDS, len(chosen), 16, 16, 3))
     for seed in range(SEEDS):
-        _, radiance = capture_radiance(
+        _, radiance, _ = capture_radiance(
             prepared.tracer,
             np.ascontiguousarray(prepared.positions[chosen]),
             chosen.astype(np.uint64),

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from octobake_client import Client, JobFailed, OctobakeClientError, ServiceError, TransferError, Unreachable
+from octobake_client import Client, JobFailed, OctobakeClientError, Point, ServiceError, TransferError, Unreachable
 from octobake_client.sse import parse
 
 from bake_core.bundle import read_bundle
@@ -169,8 +169,12 @@ def test_a_cornell_box_is_baked_through_the_service_and_its_picture_holds(server
     glb, spec = cornell()
     (tmp_path / "cornell.glb").write_bytes(glb)
     with server.client() as client:
-        bake = client.wait(client.submit(client.add_scene(tmp_path / "cornell.glb").digest, spec)).check()
+        points: list[Point] = []
+        bake = client.wait(client.submit(client.add_scene(tmp_path / "cornell.glb").digest, spec), point=points.append).check()
         assert bake.result
+        assert [(p.samples, p.rays, p.seconds, p.error) for p in points] == [(p.samples, p.rays, p.seconds, p.error) for p in bake.curve]
+        report = client.report(bake)
+        assert [p["rays"] for p in report["curve"]] == [p.rays for p in points] and report["rate"]["seconds"]["points"] == len(points)
         assert bake.result["error"] <= bake.spec["stop"]["target_error"]
         assert bake.curve[-1].error == bake.result["error"]
         progress: list[float] = []

@@ -6,7 +6,9 @@ import base64
 import hashlib
 import json
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -479,6 +481,24 @@ def test_the_page_loads_nothing_from_elsewhere(http: InProcess) -> None:
         assert path in page.text
         assert http.get(path).status_code == 200
     assert "//" not in page.text.replace("<!doctype html>", "")
+
+
+def test_a_bake_has_a_page_and_its_curve_a_picture(http: InProcess, service: Service) -> None:
+    job = service.store.add_job(Kind.BAKE, {"scene": "sha256:" + "0" * 64, "spec": {"stop": {"target_error": 0.02}}}, {}, 0).id
+    page = http.get(f"/web/bakes/{job}")
+    assert page.status_code == 200 and "/web/bake.js" in page.text and http.get("/web/bake.js").status_code == 200
+    assert "no error above 0" in http.get(f"/web/bakes/{job}/curve.svg").text
+    for index, samples in enumerate((16, 32, 64)):
+        opened = service.store.begin_pass(job, index, samples // 2, samples, 1)
+        done = replace(opened, state="sums", error=0.8 / samples**0.5, seconds=samples / 8, rays=samples * 1000)
+        progress = {"stage": "tracing", "fraction": 0.5, "samples": samples, "error": done.error, "seconds": done.seconds, "eta": None}
+        service.store.commit_pass(job, done, progress)
+    answer = http.get(f"/web/bakes/{job}/curve.svg")
+    assert answer.headers["content-type"].startswith("image/svg+xml")
+    words = [t.text for t in ElementTree.fromstring(answer.text).iter("{http://www.w3.org/2000/svg}text")]
+    assert "rate -0.50 ± 0.00" in words and "target 2 %" in words
+    assert http.get(f"/v1/bakes/{job}").json()["curve"][1] == {"samples": 32, "rays": 32000, "seconds": 4.0, "error": 0.8 / 32**0.5}
+    problem(http.get("/web/bakes/x/curve.svg"), 404, "bake.unknown")
 
 
 def test_a_job_of_the_other_kind_is_unknown(http: InProcess, service: Service) -> None:

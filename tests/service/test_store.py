@@ -85,9 +85,9 @@ def test_a_shard_is_committed_once(store: Store) -> None:
     store.commit_shard(job, 0, 1, "first", 1.0)
     store.commit_shard(job, 0, 1, "second", 2.0)
     assert {i: s.tally for i, s in store.shards(job, 0).items()} == {1: "first"}
-    store.commit_pass(job, replace(opened, state="sums", error=0.5, seconds=3.0), {"stage": "tracing"})
-    assert [(p.last, p.state, p.error, p.seconds) for p in store.passes(job)] == [(16, "sums", 0.5, 3.0)]
-    assert store.events(job)[-1].data == {"samples": 16, "error": 0.5, "seconds": 3.0}
+    store.commit_pass(job, replace(opened, state="sums", error=0.5, seconds=3.0, rays=7), {"stage": "tracing"})
+    assert [(p.last, p.state, p.error, p.seconds, p.rays) for p in store.passes(job)] == [(16, "sums", 0.5, 3.0, 7)]
+    assert store.events(job)[-1].data == {"samples": 16, "rays": 7, "seconds": 3.0, "error": 0.5}
 
 
 def test_what_is_committed_is_on_the_disk(store: Store) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import asdict
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.bake import BakeResult, Run, bake, empty_state, finish, prepare, shard_ranges, trace_shard
+from bake_core.bake import BakeResult, bake, empty_state, finish, prepare, shard_ranges, trace_shard
 from bake_core.bundle import read_bundle, read_report
-from bake_core.convergence import next_pass
+from bake_core.convergence import Point, next_pass
 from bake_core.environment import beside
 from bake_core.errors import BakeError, Cancelled, SceneError
 from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
@@ -22,6 +23,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
 from bake_core.octahedral import texel_directions, with_border
 from bake_core.progress import Progress
+from bake_core.report import Run
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from tests.baking import maps
@@ -65,11 +67,13 @@ def test_the_same_bytes_with_textures_holes_gloss_and_a_sky(tmp_path: Path) -> N
 
 def baked_alike(scene: Path, spec: dict[str, Any]) -> int:
     """Bake in every way: the manifest and every file that it names are the same; the number of EXRs among them."""
-    made = []
+    made, rays = [], set()
     for threads, shards, out in ((1, 1, "a"), (2, 1, "b"), (1, 3, "c"), (2, 3, "d.zip"), (3, 1000, "e")):
-        bake(scene, parse_spec(spec), scene.parent / out, threads=threads, shards=shards, find=beside(scene.parent))
+        result = bake(scene, parse_spec(spec), scene.parent / out, threads=threads, shards=shards, find=beside(scene.parent))
         made.append(files(scene.parent / out))
+        rays.add(tuple(p.rays for p in result.run.curve))
         read_bundle(scene.parent / out)
+    assert len(rays) == 1, "so is the number of rays after each pass"
     for other in made[1:]:
         assert other.keys() == made[0].keys()
         assert [name for name in other if other[name] != made[0][name]] == []
@@ -155,7 +159,7 @@ def test_the_curve_has_a_point_for_each_doubling_and_errors_fall(tmp_path: Path)
     assert result.manifest["error"] == {"value": errors[-1], "target": None, "scrambles": 4}
     report = read_report(tmp_path / "out")
     assert report is not None
-    assert report["curve"] == [{"samples": p.samples, "seconds": p.seconds, "error": p.error} for p in result.run.curve]
+    assert report["curve"] == [asdict(p) for p in result.run.curve]
     assert set(report["stages"]) == {"reading", "building", "compiling", "tracing", "writing"}
 
 
@@ -178,6 +182,16 @@ def test_the_error_figure_is_no_smaller_than_the_error(tmp_path: Path) -> None:
     error = np.sqrt((((a - b) ** 2).sum(-1) / (square + (0.05 * np.sqrt(square).mean()) ** 2)).mean())
     claimed = few.manifest["error"]["value"]
     assert error < claimed < 2 * error
+
+
+def test_who_is_told_of_points_hears_each_as_it_is_measured(tmp_path: Path) -> None:
+    glb, spec = small_cornell(max_samples=64)
+    told: list[Point] = []
+    result = bake_into(tmp_path, glb, spec, point=told.append)
+    assert told == result.run.curve and [p.samples for p in told] == [16, 32, 64]
+    # Each pass of a probe's 16 × 16 texels is at least that many rays; the first has those for distances, 64 × 64, as well.
+    steps = np.diff([p.rays for p in told], prepend=0) / 27
+    assert steps[0] > 16 * 256 + 4096 and (steps[1:] > np.array([16, 32]) * 256).all() and steps[2] == pytest.approx(2 * steps[1], rel=0.02)
 
 
 # --- cancelling, failing --------------------------------------------------------------------------------------------------------------
@@ -203,6 +217,19 @@ def test_cancelling_ends_within_half_a_second_and_leaves_nothing(tmp_path: Path)
         bake_into(tmp_path, glb, endless, progress=watch, cancelled=flag, threads=2)
     assert time.perf_counter() - cancelled_at[0] < 0.5
     assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]
+
+
+def test_a_bake_that_is_stopped_writes_the_passes_that_are_whole(tmp_path: Path) -> None:
+    """Stopped in its second pass it is the bake of 16 samples, but for what the manifest says of its end."""
+    glb, spec = small_cornell(max_samples=16)
+    bake_into(tmp_path, glb, spec, "short")
+    flag = np.zeros(1, np.uint8)
+    endless = {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}}
+    result = bake_into(tmp_path, glb, endless, point=lambda _: flag.fill(1), cancelled=flag)
+    assert result.run.stopped == "interrupt" == result.manifest["stopped"] and result.manifest["samples"] == 16
+    assert not result.met, "nobody asked for 16 samples"
+    short, out = files(tmp_path / "short"), files(tmp_path / "out")
+    assert short.keys() == out.keys() and {n for n in out if out[n] != short[n]} == {"manifest.json"}
 
 
 def test_what_cannot_be_stored_is_an_error_and_never_an_infinity(tmp_path: Path) -> None:

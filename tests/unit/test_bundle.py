@@ -66,7 +66,7 @@ def test_what_is_in_it(baked: Path) -> None:
     expected = {"manifest.json", "box.irradiance.exr", "box.visibility.exr", "box.probes.exr"}
     expected |= {f"shaders/{n}" for n in ("octahedral.glsl", "grid.glsl", "irradiance.glsl", "constants.glsl", "README.md")}
     assert set(files(baked / "bundle")) == expected
-    assert {p.name for p in (baked / "bundle").iterdir()} >= {"report.json", "report.html"}
+    assert {p.name for p in (baked / "bundle").iterdir()} >= {"report.json", "report.html", "report.svg", "report.png"}
 
 
 def test_folder_and_zip_hold_the_same(baked: Path) -> None:

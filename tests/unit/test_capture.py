@@ -29,7 +29,7 @@ POSITIONS = np.array([[-0.55, -0.45, -0.6], [0.45, 0.55, 0.4], [0.1, 0.2, -0.3],
 def gather(
     tracer: Tracer, positions: Array, samples: tuple[int, int], *, ids: Array | None = None, threads: int = 1, **capture: Any
 ) -> Any:
-    """(irradiance sums, radiance sums)."""
+    """(irradiance sums, radiance sums, rays)."""
     chosen = {"resolution": 16, "irradiance_resolution": 8, "seed": 0, "keep_radiance": False} | capture
     return capture_radiance(
         tracer,
@@ -78,6 +78,29 @@ def beside_two_emitters() -> tuple[Scene, Array]:
     return scene, truth
 
 
+def rays(tracer: Tracer, samples: int) -> int:
+    count: int = gather(tracer, np.array([[0.1, 0.2, -0.3]]), (0, samples))[2]
+    return count
+
+
+@pytest.mark.parametrize("bounces", [0, 1, 3])
+def test_every_ray_is_counted(bounces: int) -> None:
+    """By hand, for 256 texels and 8 samples in a sealed box whose paths never end by themselves."""
+    paths = 256 * 8
+    dark, glowing = (load_example(closed_box(1.0, emission)[0]) for emission in (0.0, 1.0))
+    point = {"kind": "point", "position": [0.0, 0.3, 0.0], "intensity": [1.0, 1.0, 1.0]}
+    # Nothing shines: a ray to each vertex, but none after the last scatter event, which could find nothing.
+    assert rays(build(dark, max_bounces=bounces), 8) == paths * max(bounces, 1)
+    # The last ray asks for the sky.
+    assert rays(build(dark, max_bounces=bounces, environment=sky()), 8) == paths * (bounces + 1)
+    # At every vertex but the probe one towards the lamp, which all of a convex room's walls face.
+    assert rays(build(dark, max_bounces=bounces, lights=[point]), 8) == paths * (max(bounces, 1) + bounces)
+    # Walls that emit: the last ray looks for them; at each vertex one towards a point of them, unless that lies on the vertex's own wall;
+    # from the probe one for every four paths.
+    counted = rays(build(glowing, max_bounces=bounces), 8)
+    assert paths * (bounces + 1) + paths // 4 + 0.7 * paths * bounces <= counted <= paths * (2 * bounces + 1) + paths // 4
+
+
 @pytest.mark.parametrize("resolution", [8, 16, 32])
 def test_the_size_of_capture_texels_is_not_in_the_result(resolution: int) -> None:
     """Two square emitters from aside, for every normal: the covariance term takes the blur out."""
@@ -102,7 +125,7 @@ def test_a_first_pass_of_few_samples_is_all_but_unbiased() -> None:
 @pytest.mark.parametrize("samples", [1, 2, 4, 5, 8, 19])
 def test_constant_light_is_exact_at_any_number_of_samples(samples: int) -> None:
     tracer = build(load_example(two_rooms()[0]), environment=sky(2.5))
-    irradiance, radiance = gather(tracer, np.array([[0.0, 50.0, 0.0], [900.0, 0, 0]])[1:], (0, samples), keep_radiance=True)
+    irradiance, radiance, _ = gather(tracer, np.array([[0.0, 50.0, 0.0], [900.0, 0, 0]])[1:], (0, samples), keep_radiance=True)
     # From 900 m away the rooms are one texel's concern.
     e = irradiance.sum(1)[0] / samples
     assert np.median(np.abs(e / (2.5 * math.pi) - 1)) < 1e-6
@@ -129,7 +152,7 @@ def test_the_same_bits_for_any_threads_and_any_shards() -> None:
     ids = np.arange(10, dtype=np.uint64)
     for part in (slice(0, 1), slice(3, 10)):
         again = gather(tracer, POSITIONS[part], (0, 8), ids=ids[part], keep_radiance=True)
-        assert all(np.array_equal(a[part], b) for a, b in zip(whole, again, strict=True))
+        assert all(np.array_equal(a[part], b) for a, b in zip(whole[:2], again[:2], strict=True))
 
 
 def test_probe_number_and_seed_choose_the_samples() -> None:
@@ -196,7 +219,7 @@ def test_distances_normals_and_sides_in_a_box_and_outside_it() -> None:
     """Slabs: the nearest wall along each texel's direction."""
     tracer = build(load_example(closed_box(0.5, 1.0)[0]))
     inside, outside = np.array([0.3, -0.2, 0.5]), np.array([0.0, 3.0, 0.0])
-    distance, normal, back = capture_distance(tracer, np.stack([inside, outside]), 16, cancelled=np.zeros(1, np.uint8))
+    distance, normal, back, _ = capture_distance(tracer, np.stack([inside, outside]), 16, cancelled=np.zeros(1, np.uint8))
     d = normals(16)
     d[d == 0] = 1e-300  # a texel's centre on a fold
     steps = (np.sign(d) - inside) / d
@@ -215,6 +238,6 @@ def test_distances_normals_and_sides_in_a_box_and_outside_it() -> None:
 def test_backs_of_double_sided_surfaces_are_no_backs() -> None:
     for double_sided in (False, True):
         tracer = build(square_scene(double_sided=double_sided))
-        distance, _, back = capture_distance(tracer, np.array([[0.0, -0.5, 0.0]]), 16, cancelled=np.zeros(1, np.uint8))
+        distance, _, back, _ = capture_distance(tracer, np.array([[0.0, -0.5, 0.0]]), 16, cancelled=np.zeros(1, np.uint8))
         assert np.isfinite(distance).any()
         assert back.any() != double_sided

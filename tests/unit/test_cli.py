@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ import pytest
 
 from bake_core import irradiance
 from bake_core.bundle import content_digest, read_bundle
+from bake_core.convergence import Point
 from bake_core.examples import closed_box, square_emitter
+from bake_core.progress import Progress
 from service.cli import COMMANDS, main, parser
+from service.cli.progress import ProgressLine, count
 from tests.faults.corpus import Fault, corpus
 
 FEW = {"target_error": None, "max_samples": 4}
@@ -202,10 +206,18 @@ def test_a_broken_machine_is_3(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.glb", "spec.json"]
 
 
-@pytest.mark.parametrize(("stage", "code", "says"), [("tracing", 3, "[bake.cancelled]"), ("compiling", 130, "interrupted")])
-def test_ctrl_c_ends_a_bake_at_once_and_leaves_nothing(stage: str, code: int, says: str, tmp_path: Path) -> None:
-    """As a process of its own: a line, no traceback, no file; where kernels must be compiled first, too."""
-    glb, spec = closed_box(0.99, 1.0)
+@pytest.mark.parametrize(
+    ("stage", "albedo", "sent", "code", "says"),
+    [
+        ("tracing", 0.999, signal.SIGINT, 3, "[bake.cancelled]"),
+        ("compiling", 0.5, signal.SIGINT, 130, "interrupted"),
+        ("pass done", 0.5, signal.SIGINT, 4, "interrupted; the bundle holds what"),
+        ("pass done", 0.5, signal.SIGTERM, 4, "interrupted; the bundle holds what"),
+    ],
+)
+def test_ctrl_c_ends_a_bake_at_once(stage: str, albedo: float, sent: signal.Signals, code: int, says: str, tmp_path: Path) -> None:
+    """As a process of its own: a line, no traceback; no file before the first pass has ended, a bundle of the best so far from then on."""
+    glb, spec = closed_box(albedo, 1.0)
     scene, spec_file = write(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}})
     command = [sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())"]
     kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if stage == "compiling" else {}
@@ -221,15 +233,55 @@ def test_ctrl_c_ends_a_bake_at_once_and_leaves_nothing(stage: str, code: int, sa
         assert process.stderr is not None
         while stage not in (line := process.stderr.readline()):
             assert line, "the bake ended by itself"
-        process.send_signal(signal.SIGINT)
-        sent = time.perf_counter()
+        process.send_signal(sent)
+        sent_at = time.perf_counter()
         out, err = process.communicate(timeout=20)
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == code and time.perf_counter() - sent < 3
-    assert out == "" and says in err and "Traceback" not in err
-    assert {p.name for p in tmp_path.iterdir()} <= {"scene.glb", "spec.json", "kernels"}
+    assert process.returncode == code and time.perf_counter() - sent_at < 3
+    assert says in err and "Traceback" not in err
+    left = {p.name for p in tmp_path.iterdir()} - {"scene.glb", "spec.json", "kernels"}
+    if code != 4:
+        assert out == "" and not left
+        return
+    assert left == {"out"}
+    manifest = read_bundle(tmp_path / "out").manifest
+    assert manifest["stopped"] == "interrupt" and manifest["samples"] >= 16 and f"{manifest['samples']} samples" in out
+
+
+@pytest.mark.parametrize(("times", "code"), [(1, 4), (2, 130)])
+def test_a_second_ctrl_c_writes_nothing(times: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: Any) -> None:
+        for _number in range(times):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(ProgressLine, "point", interrupt)
+    glb, spec = closed_box(0.5, 1.0)
+    scene, spec_file = write(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 1 << 24}})
+    assert main(["bake", scene, "--spec", spec_file, "-o", str(tmp_path / "out")]) == code
+    assert {p.name for p in tmp_path.iterdir()} - {"scene.glb", "spec.json"} == ({"out"} if code == 4 else set())
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_new_point_stays_above_the_line_that_is_redrawn(terminal: bool) -> None:
+    class Stream(StringIO):
+        def isatty(self) -> bool:
+            return terminal
+
+    stream = Stream()
+    line = ProgressLine(stream)
+    line(Progress("tracing", 0.5))
+    line.point(Point(64, 3_140_000, 12.4, 0.031))
+    # What a terminal shows of it: each line as it was last drawn.
+    shown = [part.split("\r")[-1].replace("\x1b[K", "") for part in stream.getvalue().split("\n")]
+    assert "pass done: 64 samples, 3.1 M rays, 12 s, error 3.1 %" in shown
+    assert ("tracing  50 %" in shown[-1]) == terminal
+
+
+@pytest.mark.parametrize(("number", "text"), [(0, "0"), (999, "999"), (12_345, "12 k"), (3_140_000, "3.1 M"), (5_000_000_000, "5.0 G")])
+def test_large_numbers_are_short(number: int, text: str) -> None:
+    assert count(number) == text
 
 
 # --- plan, info ------------------------------------------------------------------------------------------------------------------------
@@ -250,7 +302,17 @@ def test_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_info(baked: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(baked)]) == 0
     text = capsys.readouterr().out
-    for word in ("bundle", "sha256:", "1×1×1 probes, 1 active", "irradiance", "stored as float", "left out", "seconds"):
+    for word in (
+        "bundle",
+        "sha256:",
+        "1×1×1 probes, 1 active",
+        "irradiance",
+        "stored as float",
+        "left out",
+        "seconds",
+        "rays",
+        "against samples",
+    ):
         assert word in text
     assert main(["info", str(baked), "--json"]) == 0
     told = document(capsys)

@@ -33,7 +33,7 @@ def test_passes_double(most: int, ends: list[int]) -> None:
 
 def test_a_pass_is_shortened_to_the_time_that_is_left() -> None:
     stop = Stop(max_seconds=10.0, max_samples=4096)
-    curve = [Point(16, 2.0, 0.3), Point(32, 4.0, 0.2)]  # 8 samples a second
+    curve = [Point(16, 0, 2.0, 0.3), Point(32, 0, 4.0, 0.2)]  # 8 samples a second
     assert fit_pass(stop, (32, 64), curve, 4.0) == (32, 64)
     assert fit_pass(stop, (32, 64), curve, 8.0) == (32, 48)
     assert fit_pass(stop, (32, 64), curve, 9.0) == (32, 40)
@@ -43,15 +43,15 @@ def test_a_pass_is_shortened_to_the_time_that_is_left() -> None:
 
 
 def test_without_a_limit_or_before_anything_is_known_a_pass_is_whole() -> None:
-    assert fit_pass(Stop(), (32, 64), [Point(32, 1e9, None)], 1e9) == (32, 64)
+    assert fit_pass(Stop(), (32, 64), [Point(32, 0, 1e9, None)], 1e9) == (32, 64)
     assert fit_pass(Stop(max_seconds=1.0), (0, 16), [], 100.0) == (0, 16)
-    assert fit_pass(Stop(max_seconds=1.0), (16, 32), [Point(16, 0.0, None)], 0.5) == (16, 32)
+    assert fit_pass(Stop(max_seconds=1.0), (16, 32), [Point(16, 0, 0.0, None)], 0.5) == (16, 32)
 
 
 def test_speed_is_that_of_the_last_pass() -> None:
     """The first pass also captures distances."""
     stop = Stop(max_seconds=20.0)
-    assert fit_pass(stop, (32, 64), [Point(16, 10.0, None), Point(32, 12.0, None)], 18.0) == (32, 48)
+    assert fit_pass(stop, (32, 64), [Point(16, 0, 10.0, None), Point(32, 0, 12.0, None)], 18.0) == (32, 48)
 
 
 @pytest.mark.parametrize(

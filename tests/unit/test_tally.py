@@ -30,6 +30,7 @@ def tally(probes: tuple[int, int], samples: tuple[int, int], *, seed: int = 0, r
         backface=np.linspace(0, 0.5, PROBES, dtype=np.float32)[slice(*probes)] if first else np.zeros(0, np.float32),
         distance=np.full((n, 4), 2.0, np.float32) if first else np.zeros((0, 0), np.float32),
         normal=np.full((n, 4, 3), 1.0, np.float32) if first else np.zeros((0, 0, 0), np.float32),
+        rays=10 * n,
     )
 
 
@@ -42,6 +43,7 @@ def empty() -> State:
         backface=np.zeros(PROBES, np.float32),
         distance=np.zeros((PROBES, 4), np.float32),
         normal=np.zeros((PROBES, 4, 3), np.float32),
+        rays=0,
     )
 
 

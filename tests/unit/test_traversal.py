@@ -68,7 +68,7 @@ def embreex_hits(triangles: Array, origins: Array, directions: Array) -> tuple[A
 
 def compare(scene: Scene, probes: Array) -> None:
     """Distance, normal and side of every hit, and every miss."""
-    distance, normal, back = capture_distance(build(scene), probes - scene.origin, RESOLUTION, cancelled=np.zeros(1, np.uint8))
+    distance, normal, back, _ = capture_distance(build(scene), probes - scene.origin, RESOLUTION, cancelled=np.zeros(1, np.uint8))
     directions = texel_directions(RESOLUTION).reshape(-1, 3)
     origins = np.repeat(probes - scene.origin, len(directions), 0)
     towards = np.tile(directions, (len(probes), 1))
@@ -142,7 +142,7 @@ def test_the_nearest_of_all_triangles_by_brute_force() -> None:
     """Every ray against every triangle in float64 (Möller and Trumbore 1997), so that no Embree judges itself."""
     scene = load(soup(300))
     probes = np.random.default_rng(3).uniform(-10, 10, (4, 3))
-    distance, _, _ = capture_distance(build(scene), probes - scene.origin, RESOLUTION, cancelled=np.zeros(1, np.uint8))
+    distance, *_ = capture_distance(build(scene), probes - scene.origin, RESOLUTION, cancelled=np.zeros(1, np.uint8))
     a, b, c = (world_triangles(scene) - scene.origin).transpose(1, 0, 2)
     e, f = b - a, c - a
     directions = texel_directions(RESOLUTION).reshape(-1, 1, 3)

@@ -13,7 +13,7 @@ import httpx
 from octobake_client import sse
 from octobake_client.errors import OctobakeClientError, ServiceError, TransferError, Unreachable
 from octobake_client.files import file_digest, scene_files
-from octobake_client.jobs import FINISHED, Bake, Event, Job, Progress, Scene, Verification
+from octobake_client.jobs import FINISHED, Bake, Event, Job, Point, Progress, Scene, Verification
 
 AnyJob = TypeVar("AnyJob", bound=Job)
 # A ping comes every 15 s, so a stream silent for this long is dead.
@@ -139,11 +139,16 @@ class Client:
                 reason = _reason(e)
             self._pause(contact, url, reason)
 
-    def wait(self, job: AnyJob, progress: Callable[[Progress], None] | None = None) -> AnyJob:
-        """Follow a job until it has finished; answers it as it stands then. See :meth:`Job.check`."""
+    def wait(self, job: AnyJob, progress: Callable[[Progress], None] | None = None, point: Callable[[Point], None] | None = None) -> AnyJob:
+        """Follow a job until it has finished; answers it as it stands then. See :meth:`Job.check`.
+
+        `point` is told every point of a bake's curve, those first that there are already; `progress` only the latest.
+        """
         for event in self.events(job):
             if event.type == "progress" and progress:
                 progress(Progress.of(event.document))
+            if event.type == "pass" and point:
+                point(Point.of(event.document))
         return self._job(type(job), job.id)
 
     # Downloads

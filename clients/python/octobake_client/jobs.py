@@ -45,11 +45,12 @@ class Progress(_FromJson):
 
 @dataclass(frozen=True)
 class Point(_FromJson):
-    """A point on a bake's curve of error against seconds."""
+    """A point on a bake's curve: what there was at the end of a pass, `seconds` since its beginning; `error` may be unknown."""
 
     samples: int
-    error: float | None
+    rays: int
     seconds: float
+    error: float | None
 
 
 @dataclass(frozen=True)
