@@ -8,10 +8,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.examples import closed_box, plane_under_sun
+from bake_core.examples import closed_box, plane_under_sun, quads_part
 from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.gltf.writer import GlbWriter
-from bake_core.examples import quads_part
 from bake_core.irradiance import sample
 from bake_core.octahedral import texel_directions, texel_solid_angles
 from bake_core.stability.case import Baker, Case, Result, at_most, maps, one_probe, samples

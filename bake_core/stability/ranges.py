@@ -68,7 +68,7 @@ def tiny_emitter(baker: Baker) -> Result:
 def _placed(name: str, *, scale: float = 1.0, translation: float = 0.0) -> Case:
     def run(baker: Baker) -> Result:
         glb, _ = cornell()
-        at = np.array([-0.8, 0.2, -0.8])
+        at = np.array([-0.8, 0.25, -0.8])
         grid = [{"origin": at.tolist(), "spacing": [0.5] * 3, "counts": [4, 4, 4]}]
         moved = [{"origin": (at * scale + translation).tolist(), "spacing": [0.5 * scale] * 3, "counts": [4, 4, 4]}]
         plain = baker((glb, {"volumes": grid}), stop=samples(64))
