@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from bake_core.gltf.writer import GlbWriter, Part
-from bake_core.stability.case import FLOAT_ROUNDING, HALF_ROUNDING, SIGMAS, Baker, Case, Result, maps, near, one_probe, samples, sky
+from bake_core.stability.case import HALF_ROUNDING, SIGMAS, Baker, Case, Result, maps, near, one_probe, samples, sky
 from bake_core.stability.closed_rooms import furnace_sigma
 from bake_core.stability.scenes import sphere
 
@@ -24,7 +24,7 @@ def instances(baker: Baker) -> Result:
     for place, turn in zip(places.tolist(), turns.tolist(), strict=True):
         w.node(mesh=mesh, translation=place, rotation=turn, scale=(0.01, 0.01, 0.01))
     bundle = baker((w.to_glb(), {"volumes": one_probe((-4, -4, -4), 8.0, (2, 2, 2)), "environment": sky(1.0)}), stop=samples(8))
-    return near(math.pi, maps(bundle), FLOAT_ROUNDING + HALF_ROUNDING, "every texel: π L, no path carries more or less; half floats")
+    return near(math.pi, maps(bundle), HALF_ROUNDING, "every texel: π L, no path carries more or less; half floats")
 
 
 def lights_and_emitters(baker: Baker) -> Result:
@@ -42,7 +42,9 @@ def lights_and_emitters(baker: Baker) -> Result:
     # The facets lie up to h²/8 nearer than R, h their longest side, √2 times 2π/segments: E is greater by twice that.
     facets = 2 * 2 * (2 * math.pi / segments) ** 2 / 8
     tolerance = SIGMAS * furnace_sigma(albedo) / math.sqrt(paths) + HALF_ROUNDING + facets
-    return near(expected, maps(bundle).mean(), tolerance, f"mean irradiance, (π Le + a·64 I/R²)/(1 − a); 4σ of {paths} paths, and the ball's facets")
+    return near(
+        expected, maps(bundle).mean(), tolerance, f"mean irradiance, (π Le + a·64 I/R²)/(1 − a); 4σ of {paths} paths, and the ball's facets"
+    )
 
 
 CASES = (

@@ -39,10 +39,16 @@ def _moments(size: float) -> Case:
         mean, square = weight @ distance, weight @ distance**2
         truth = _spread(mean, square)
         lost = np.abs(_spread(found[:, 0], found[:, 1]) / truth - 1).max()
-        half = found.astype(np.float16).astype(np.float64) if size < 1 else (found / size**np.array([1, 2])).astype(np.float16).astype(np.float64)
+        # Half floats where they can hold these at all: of moments in units of the box.
+        half = (
+            found.astype(np.float16).astype(np.float64)
+            if size < 1
+            else (found / size ** np.array([1, 2])).astype(np.float16).astype(np.float64)
+        )
         negative = float((half[:, 1] < half[:, 0] ** 2).mean())
         note = (
-            "worst relative error of σ = √(E[d²] − E[d]²) against float64. Float32 moments err by 2⁻²⁴ each, σ² by 3·2⁻²⁴ of the mean's square: "
+            "worst relative error of σ = √(E[d²] − E[d]²) against float64. Float32 moments err by 2⁻²⁴ each, σ² by 3·2⁻²⁴ "
+            "of the mean's square: "
             f"1 % of σ wants a mean above 330 σ, here it is {float((mean / truth).max()):.0f} σ at most, at any scale. "
             f"Of half floats {negative:.0%} of variances would be negative"
         )
@@ -83,9 +89,13 @@ def poles_and_folds(baker: Baker) -> Result:
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     found = np.stack([sample(bundle.volumes, np.tile([0.0, 1.0, 0.0], (len(directions), 1)), n / length).irradiance[:, 0] for n in nudged])
     texels = maps(bundle)
-    # Bilinear look-up changes by the difference of neighbouring texels in a texel's width, 1/8 of the square here; n moves by 2 hairs at most.
+    # Bilinear look-up changes by the difference of neighbouring texels in a texel's width, 1/8 of the square here; n moves by 2 hairs.
     bound = 2 * step * 8 * 3 * float(texels.max()) + 2.0**-22 * float(texels.max())
-    return at_most(bound, float(np.ptp(found, axis=0).max()), "largest jump of E between the sides of a seam, at 26 directions; what 1e-9 rad can change, and float32")
+    return at_most(
+        bound,
+        float(np.ptp(found, axis=0).max()),
+        "largest jump of E between the sides of a seam, at 26 directions; what 1e-9 rad can change, and float32",
+    )
 
 
 CASES = (
@@ -95,7 +105,8 @@ CASES = (
         "distances in a box moved by 1e6 m",
         (under_root(closed_box(0.5, 1.0)[0], translation=1e6), np.full(3, 1e6)),
         _INSET + 2.0**-21,
-        "worst error of a distance, metres, against the slabs: hits are held 2⁻¹⁷ inside their triangles, all else is float32 about the scene's own middle",
+        "worst error of a distance, metres, against the slabs: hits are held 2⁻¹⁷ inside their triangles, and float32 counts from the "
+        "scene's own middle",
     ),
     _distances(
         "distances in boxes 1e6 m apart",

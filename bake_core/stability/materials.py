@@ -34,7 +34,9 @@ def _white(metallic: float, roughness: float) -> Case:
         # A direction is drawn from half visible normals, half a matt surface's, of which none weighs more than 3 (docs/method.md): with a
         # mean of 1, Bhatia and Davis 2000 limit the variance to (3 - 1)(1 - 0).
         tolerance = SIGMAS * math.sqrt(2 / paths) + HALF_ROUNDING
-        return near(math.pi, found, tolerance, f"mean irradiance about a sphere that reflects all, π L; 4σ of {paths} paths of weight 0 to 3")
+        return near(
+            math.pi, found, tolerance, f"mean irradiance about a sphere that reflects all, π L; 4σ of {paths} paths of weight 0 to 3"
+        )
 
     return Case(f"white, metallic {metallic:g}, roughness {roughness:g}", run)
 

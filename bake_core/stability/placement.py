@@ -49,7 +49,12 @@ def _normals() -> NDArray[np.float64]:
 
 def near_a_wall(baker: Baker) -> Result:
     bundle = baker(closed_box(0.5, 1.0), volumes=one_probe((-1 + 1e-6, 0.2, -0.3)), stop=samples(_COUNT))
-    return near(2 * math.pi, maps(bundle).mean(), SIGMAS * furnace_sigma(0.5) / math.sqrt(_TEXELS * _COUNT) + HALF_ROUNDING, "mean irradiance, 2π Le; 4σ")
+    return near(
+        2 * math.pi,
+        maps(bundle).mean(),
+        SIGMAS * furnace_sigma(0.5) / math.sqrt(_TEXELS * _COUNT) + HALF_ROUNDING,
+        "mean irradiance, 2π Le; 4σ",
+    )
 
 
 def inside_a_solid(baker: Baker) -> Result:
@@ -57,7 +62,12 @@ def inside_a_solid(baker: Baker) -> Result:
     volumes = [{"origin": [0.1, 0.1, 0.1], "spacing": [3.0] * 3, "counts": [2, 1, 1]}]
     bundle = baker((glb, {"volumes": volumes, "environment": sky(1.0)}), stop=samples(4))
     inside, outside = bundle.volumes[0].states
-    return Result(0.0, float(inside) + (1.0 - float(outside)) + float(maps(bundle)[0].max()), 0.0, "probes that are active inside or not outside, and light inside: none")
+    return Result(
+        0.0,
+        float(inside) + (1.0 - float(outside)) + float(maps(bundle)[0].max()),
+        0.0,
+        "probes that are active inside or not outside, and light inside: none",
+    )
 
 
 def _grid(counts: tuple[int, int, int]) -> Case:

@@ -7,7 +7,7 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ def run_case(case: Case, *, threads: int, cancelled: NDArray[np.uint8]) -> Outco
 
 
 def run_cases(
-    cases: tuple[Case, ...] = CASES, *, threads: int, cancelled: NDArray[np.uint8], done: Callable[[Outcome], None] = lambda outcome: None
+    cases: Sequence[Case], *, threads: int, cancelled: NDArray[np.uint8], done: Callable[[Outcome], None] = lambda outcome: None
 ) -> list[Outcome]:
     """Run cases in turn; `done` hears of each.
 
@@ -138,13 +138,14 @@ def write_report(outcomes: list[Outcome], folder: Path) -> Path:
     )
     head = "".join(f"<th>{h}</th>" for h in ("case", "expected", "measured", "tolerance", "verdict", "seconds", "what the numbers are"))
     page = (
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'><title>octobake stability</title>"
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
+        "<title>octobake stability</title>"
         "<style>body{font:16px system-ui;max-width:90rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse;margin:1rem 0}"
         "td,th{padding:.2rem .8rem;border-bottom:1px solid #ccc;text-align:left;vertical-align:top}td:nth-child(-n+6){white-space:nowrap}"
         "td:last-child{color:#555}.bad{color:#b2182b}</style>"
         f"<h1>Stiff and extreme cases: {f'{failed} of {len(outcomes)} failed' if failed else f'all {len(outcomes)} pass'}</h1>"
-        f"<p>{sum(o.seconds for o in outcomes):.0f} s on {os.cpu_count()} cores, kernels compiled where they were not cached. A case passes where measured is "
-        "within the tolerance of expected; tolerances are four standard errors of the stated samples, or bounds of rounding.</p>"
+        f"<p>{sum(o.seconds for o in outcomes):.0f} s on {os.cpu_count()} cores, kernels compiled where they were not cached. A case passes "
+        "where measured is within the tolerance of expected; tolerances are four standard errors of the stated samples, or bounds of rounding.</p>"
         f"<table><tr>{head}</tr>{rows}</table></html>\n"
     )
     path = folder / "report.html"

@@ -63,8 +63,9 @@ def under_root(glb: bytes, *, scale: float = 1.0, translation: float = 0.0) -> b
 
 
 def polygon_vector(corners: ArrayLike, point: ArrayLike) -> F64:
-    """Vector irradiance at a point from a polygon of radiance 1: its product with a normal is the irradiance of a receiver that sees all of it.
+    """Vector irradiance at a point from a polygon of radiance 1.
 
+    Its product with a normal is the irradiance of a receiver that sees all of the polygon.
     Lambert 1760, "Photometria": ½ Σ θ_i Γ_i over the polygon's edges, θ the angle that an edge spans and Γ the unit normal of its
     plane. Its sign follows the way the corners run.
     """

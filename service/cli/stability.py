@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
     previous = signal.signal(signal.SIGINT, stop)
     try:
-        outcomes = run_cases(threads=args.threads, cancelled=cancelled, done=tell)
+        outcomes = run_cases(CASES, threads=args.threads, cancelled=cancelled, done=tell)
     finally:
         signal.signal(signal.SIGINT, previous)
     report = write_report(outcomes, args.out) if args.out else None
@@ -58,5 +58,7 @@ def run(args: argparse.Namespace) -> int:
         widths = [max(len(row[i]) for row in rows) for i in range(5)]
         print("\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows))
         seconds = sum(o.seconds for o in outcomes)
-        print(f"{report or len(outcomes)}{'' if report else ' cases'}: {f'{len(failed)} failed' if failed else 'all passed'}, {seconds:.0f} s")
+        print(
+            f"{report or len(outcomes)}{'' if report else ' cases'}: {f'{len(failed)} failed' if failed else 'all passed'}, {seconds:.0f} s"
+        )
     return 5 if failed else 0
