@@ -144,8 +144,9 @@ def write_report(outcomes: list[Outcome], folder: Path) -> Path:
         "td,th{padding:.2rem .8rem;border-bottom:1px solid #ccc;text-align:left;vertical-align:top}td:nth-child(-n+6){white-space:nowrap}"
         "td:last-child{color:#555}.bad{color:#b2182b}</style>"
         f"<h1>Stiff and extreme cases: {f'{failed} of {len(outcomes)} failed' if failed else f'all {len(outcomes)} pass'}</h1>"
-        f"<p>{sum(o.seconds for o in outcomes):.0f} s on {os.cpu_count()} cores, kernels compiled where they were not cached. A case passes "
-        "where measured is within the tolerance of expected; tolerances are four standard errors of the stated samples, or bounds of rounding.</p>"
+        f"<p>{sum(o.seconds for o in outcomes):.0f} s on {os.cpu_count()} cores, kernels compiled where they were not cached. "
+        "A case passes where measured is within the tolerance of expected; tolerances are four standard errors of the stated samples, "
+        "or bounds of rounding.</p>"
         f"<table><tr>{head}</tr>{rows}</table></html>\n"
     )
     path = folder / "report.html"
