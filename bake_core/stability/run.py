@@ -83,8 +83,9 @@ def run_case(case: Case, *, threads: int, cancelled: NDArray[np.uint8]) -> Outco
             raise
         cancelled.fill(0)
         result = Result("an end", f"none in {_LIMIT:.0f} s", 0.0, "it hangs")
-    except OctobakeError as e:
-        result = Result("a bake", e.slug, 0.0, str(e))
+    except Exception as e:
+        # A fault of ours is a case that fails, and no reason to leave out the others.
+        result = Result("a bake", e.slug if isinstance(e, OctobakeError) else type(e).__name__, 0.0, str(e))
     finally:
         timer.cancel()
     return Outcome(case.name, result, time.perf_counter() - began)

@@ -62,6 +62,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     monkeypatch.setattr(run, "CASES", (found(2.0), Case("refused", refused)))
     assert main(["stability", "-o", str(tmp_path / "a" / "b")]) == 5
     lines = capsys.readouterr().out.splitlines()
+    broken = Case("broken", lambda baker: Result(1.0, 1 // 0, 0.0, ""))
+    assert run.run_case(broken, threads=1, cancelled=np.zeros(1, np.uint8)).result.measured == "ZeroDivisionError"
     assert lines[1].split() == ["found", "2.0", "1", "2", "0.5", "FAIL"]
     assert lines[2].split() == ["refused", "a", "bake", "scene.bad", "0", "FAIL"]
     page = (tmp_path / "a" / "b" / "report.html").read_text(encoding="utf-8")

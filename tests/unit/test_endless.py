@@ -28,8 +28,7 @@ def room(color: tuple[float, float, float], emission: float, hole: float = 0.0, 
     return prepare(load(w), parse_spec({"volumes": PROBES, **spec}))
 
 
-@pytest.mark.parametrize("color", [(1, 1, 1), (0.2, 1.0, 0.0), (0.99999,) * 3])
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("color", "threads"), [((1, 1, 1), 1), ((0.2, 1.0, 0.0), 2), ((0.99999,) * 3, 2)])
 def test_sealed_and_white_with_a_lamp(color: tuple[float, float, float], threads: int) -> None:
     """One channel that nothing absorbs is enough."""
     with pytest.raises(SceneError, match="max_bounces") as caught:
