@@ -26,6 +26,7 @@ from bake_core.assemble import assemble
 from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, decide, fit_pass, next_pass
+from bake_core.endless import check_light_ends
 from bake_core.environment import Find, no_images, read_environment
 from bake_core.errors import Cancelled, MachineError
 from bake_core.filtering import visibility_moments
@@ -180,6 +181,20 @@ def compile_kernels(prepared: Prepared) -> None:
     trace_shard(prepared, (0, 0), (0, 0), threads=1)
 
 
+def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
+    """Refuse what has no finite answer, before any pass; runs the kernels.
+
+    Raises
+    ------
+    SceneError
+        ``scene.light_never_ends``.
+    Cancelled
+    """
+    if prepared.spec.max_bounces is None:
+        flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
+        check_light_ends(prepared.scene, prepared.tracer, prepared.positions, threads=threads, cancelled=flag)
+
+
 def _see(
     prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], threads: int, flag: NDArray[np.uint8]
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
@@ -291,6 +306,7 @@ def bake(
     clock.stage("compiling")
     compile_kernels(prepared)
     clock.stage("tracing")
+    check_finite(prepared, threads=threads, cancelled=cancelled)
     state, run = empty_state(prepared), Run(threads, shards, began=clock.elapsed)
     ranges = shard_ranges(prepared.probe_count, shards)
     while run.stopped == "continue":

@@ -23,13 +23,13 @@ _QUAD = np.array([[0, 1, 2], [0, 2, 3]])
 _SIDES = ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5))
 
 
-def _box(low: Vec3, high: Vec3) -> list[Corners]:
+def box_sides(low: Vec3, high: Vec3) -> list[Corners]:
     """The six sides of a box, facing inwards, in the order -x, +x, -y, +y, -z, +z."""
     corner = np.array([[(low, high)[i >> a & 1][a] for a in range(3)] for i in range(8)], np.float64)
     return [corner[list(side)] for side in _SIDES]
 
 
-def _part(quads: Sequence[Corners], material: int, *, outwards: bool = False) -> Part:
+def quads_part(quads: Sequence[Corners], material: int, *, outwards: bool = False) -> Part:
     """Quads as one primitive, turned round where they shall face outwards."""
     quads = [q[::-1] if outwards else q for q in quads]
     indices = np.concatenate([_QUAD + 4 * i for i in range(len(quads))])
@@ -54,14 +54,14 @@ def cornell() -> Example:
     right = w.material("teal", (0.05, 0.32, 0.38))
     blocks = w.material("blocks", (0.74, 0.70, 0.60))
     lamp = w.material("lamp", (0.78, 0.78, 0.78), emission=(9.0, 7.2, 4.8))
-    sides = _box((-1, 0, -1), (1, 2, 1))
+    sides = box_sides((-1, 0, -1), (1, 2, 1))
     # The lamp hangs 1 cm below the ceiling: two surfaces in one plane would have no order.
     glow = _horizontal((-0.35, 0.35), (-0.3, 0.3), 1.99, up=False)
-    plain = _part([sides[2], sides[3], sides[4]], white)
-    room = w.mesh("room", [plain, _part([sides[0]], left), _part([sides[1]], right), _part([glow], lamp)])
+    plain = quads_part([sides[2], sides[3], sides[4]], white)
+    room = w.mesh("room", [plain, quads_part([sides[0]], left), quads_part([sides[1]], right), quads_part([glow], lamp)])
     # A block stands on the floor and has no bottom.
-    faces = _box((-0.5, 0, -0.5), (0.5, 1, 0.5))
-    block = w.mesh("block", [_part([f for i, f in enumerate(faces) if i != 2], blocks, outwards=True)])
+    faces = box_sides((-0.5, 0, -0.5), (0.5, 1, 0.5))
+    block = w.mesh("block", [quads_part([f for i, f in enumerate(faces) if i != 2], blocks, outwards=True)])
     w.node("room", mesh=room)
     w.node("tall block", mesh=block, matrix=_turned((0.58, 1.2, 0.58), (0.96, 0.28), (-0.36, 0, -0.36)))
     w.node("short block", mesh=block, matrix=_turned((0.56, 0.56, 0.56), (0.936, -0.352), (0.38, 0, 0.32)))
@@ -90,7 +90,7 @@ def closed_box(albedo: float, emission: float, max_bounces: int | None = None, *
     """
     w = GlbWriter()
     wall = w.material("wall", (albedo,) * 3, metallic=metallic, roughness=roughness, emission=(emission,) * 3)
-    w.node("box", mesh=w.mesh("box", [_part(_box((-1, -1, -1), (1, 1, 1)), wall)]))
+    w.node("box", mesh=w.mesh("box", [quads_part(box_sides((-1, -1, -1), (1, 1, 1)), wall)]))
     # Off the box's symmetries, so that no two probes see the same.
     grid = {"name": "box", "origin": [-0.55, -0.45, -0.6], "spacing": [1.0, 1.0, 1.0], "counts": [2, 2, 2]}
     stop = {"target_error": None, "max_samples": 256}
@@ -109,7 +109,7 @@ def plane_under_sun(
     """
     w = GlbWriter()
     span = (-half_width, half_width)
-    plane = _part([_horizontal(span, span, 0.0, up=True)], w.material("plane", (albedo,) * 3))
+    plane = quads_part([_horizontal(span, span, 0.0, up=True)], w.material("plane", (albedo,) * 3))
     w.node("plane", mesh=w.mesh("plane", [plane]))
     w.node("sun", light=w.light("directional", intensity=irradiance), matrix=look_at((0, 0, 0), direction))
     grid = {"name": "above", "origin": [0.0, 1.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
@@ -133,7 +133,7 @@ def square_emitter(radiance: float = 1.0, *, shared: bool = True) -> Example:
     w = GlbWriter()
     glow = w.material("glow", (0.0, 0.0, 0.0), emission=(radiance,) * 3)
     square = np.array([[1, -0.5, -0.5], [1, -0.5, 0.5], [1, 0.5, 0.5], [1, 0.5, -0.5]], np.float64)
-    part = _part([square], glow)
+    part = quads_part([square], glow)
     mesh = w.mesh("square", [part])
     w.node("square", mesh=mesh)
     w.node("twin", mesh=mesh if shared else w.mesh("twin", [part]), scale=(-1, 1, 1))
@@ -158,8 +158,8 @@ def two_rooms(albedo: float = 0.7) -> Example:
     wall = w.material("wall", (albedo,) * 3)
     lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(10.0, 10.0, 10.0))
     glow = _horizontal((-2.51, -1.51), (-0.5, 0.5), 2.98, up=False)
-    lit = w.mesh("lit room", [_part(_box((-4.01, 0, -2), (-0.01, 3, 2)), wall), _part([glow], lamp)])
-    dark = w.mesh("dark room", [_part(_box((0.01, 0, -2), (4.01, 3, 2)), wall)])
+    lit = w.mesh("lit room", [quads_part(box_sides((-4.01, 0, -2), (-0.01, 3, 2)), wall), quads_part([glow], lamp)])
+    dark = w.mesh("dark room", [quads_part(box_sides((0.01, 0, -2), (4.01, 3, 2)), wall)])
     w.node("lit room", mesh=lit)
     w.node("dark room", mesh=dark)
     w.node("lit", camera=w.camera(math.radians(70)), matrix=look_at((-3.8, 1.6, 1.8), (-0.5, 1.2, -1.0)))

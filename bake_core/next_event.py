@@ -69,7 +69,8 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
             radiance = emission_left(t, material, triangle, np.float64(b1), np.float64(b2))
             if radiance[0] + radiance[1] + radiance[2] > 0:
                 pdf = pdf_emitter(t, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
-    lift = side * EPSILON * (abs(x) + abs(y) + abs(z))
+    # A shadow ray's end errs by an ulp of its own length too: a lamp about zero would else block itself.
+    lift = side * EPSILON * (abs(x) + abs(y) + abs(z) + d)
     lifted = (x + lift * e.normal[i, 0], y + lift * e.normal[i, 1], z + lift * e.normal[i, 2])
     return radiance, (dx, dy, dz), pdf, lifted
 

@@ -77,9 +77,11 @@ def prepare(work: Work) -> tuple[int, int]:
 
 
 def compile_kernels(work: Work) -> None:
-    """Compile what the scene needs, or fetch it from the cache: its time is no sample's."""
-    with _task():
-        bake.compile_kernels(_prepared(work))
+    """Compile what the scene needs, or fetch it from the cache: its time is no sample's. Then see that the scene has a finite answer."""
+    with _task() as task:
+        prepared = _prepared(work)
+        bake.compile_kernels(prepared)
+        bake.check_finite(prepared, threads=work.own_threads, cancelled=task.flag)
 
 
 def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int]) -> tuple[str, float]:

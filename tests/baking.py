@@ -6,15 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bake_core.atlas import Layout, unpack
 from bake_core.bake import bake
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.environment import beside
 from bake_core.examples import Example
 from bake_core.spec import parse_spec
+from bake_core.stability.case import maps
+
+__all__ = ["THREADS", "bake_example", "maps"]
 
 THREADS = os.cpu_count() or 1
 
@@ -26,10 +25,3 @@ def bake_example(folder: Path, example: Example, *, threads: int = THREADS, shar
     scene.write_bytes(glb)
     bake(scene, parse_spec({**spec, **changes}), folder / "bundle", threads=threads, shards=shards, find=beside(folder))
     return read_bundle(folder / "bundle")
-
-
-def maps(bundle: Bundle, output: str = "irradiance", volume: int = 0) -> NDArray[np.float64]:
-    """Every probe's map without borders, (n, t, t, channels)."""
-    v = bundle.volumes[volume]
-    a = v.atlases[output]
-    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), len(v.states)).astype(np.float64)

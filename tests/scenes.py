@@ -16,6 +16,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.scene import Camera, Scene
 from bake_core.spec import parse_spec
+from bake_core.stability.scenes import polygon_vector
 from bake_core.tracer import Tracer
 
 Array = NDArray[Any]
@@ -80,16 +81,5 @@ def camera_at(eye: Sequence[float], target: Sequence[float], *, width: float) ->
 
 
 def polygon_irradiance(corners: ArrayLike, point: ArrayLike, normal: ArrayLike) -> float:
-    """Irradiance at a point from a polygon of radiance 1 that lies wholly above its horizon.
-
-    Lambert 1760, "Photometria": E = ½ Σ θ_i n·Γ_i over the polygon's edges, θ the angle that an edge spans and Γ the unit normal of
-    its plane. Positive whichever way the corners run.
-    """
-    v = np.asarray(corners, np.float64) - np.asarray(point, np.float64)
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    total = 0.0
-    for a, b in zip(v, np.roll(v, -1, 0), strict=True):
-        plane = np.cross(a, b)
-        sine = float(np.linalg.norm(plane))
-        total += math.atan2(sine, float(a @ b)) * float(plane @ np.asarray(normal, np.float64)) / sine
-    return abs(total) / 2
+    """Irradiance at a point from a polygon of radiance 1 that lies wholly above its horizon; positive whichever way the corners run."""
+    return abs(float(polygon_vector(corners, point) @ np.asarray(normal, np.float64)))

@@ -79,7 +79,7 @@ def test_a_plane_under_a_small_sun(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("metallic", "roughness"), [(0.0, 1.0), (1.0, 0.1), (0.0, 0.3)])
 def test_an_even_image_is_a_constant_sky(tmp_path: Path, metallic: float, roughness: float) -> None:
     """A white sphere under an image of ones: sampled as lights and by reflection, π all the same."""
-    from tests.closed_form.test_gloss import white_sphere
+    from bake_core.stability.materials import white_sphere
 
     write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32), ("R", "G", "B"))
     bundle = bake_example(tmp_path, white_sphere(metallic, roughness), environment={"kind": "equirect", "image": "sky.exr"})

@@ -246,3 +246,11 @@ def test_exit_codes_are_documented() -> None:
     documented = rows(page("cli.md").split("## octobake")[0])
     assert {int(c) for c in re.findall(r"\b(\d)\b", EXIT_CODES)} <= {int(k) for k in documented}
     assert "130" in documented
+
+
+def test_every_stability_case_is_on_its_page() -> None:
+    from bake_core.stability.run import CASES
+
+    (printed,) = re.findall(r"```\n(case .*?)```", page("stability.md"), re.DOTALL)
+    listed = [re.split(r"  +", line)[0] for line in printed.splitlines()[1:]]
+    assert listed == [c.name for c in CASES], "run: octobake stability, and put its table on the page"

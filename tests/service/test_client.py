@@ -14,7 +14,7 @@ from octobake_client import Client, JobFailed, OctobakeClientError, Point, Servi
 from octobake_client.sse import parse
 
 from bake_core.bundle import read_bundle
-from bake_core.examples import cornell
+from bake_core.examples import closed_box, cornell
 from tests.service.running import Server, box_spec, octobake
 
 
@@ -149,6 +149,17 @@ def test_a_failed_job_tells_why(server: Server, box: Path) -> None:
         with pytest.raises(JobFailed) as caught:
             client.wait(job).check()
         assert (caught.value.slug, caught.value.exit_code) == ("bake.cancelled", 3)
+
+
+def test_a_scene_without_an_answer_is_refused_by_the_worker(server: Server, tmp_path: Path) -> None:
+    """Sound glTF and a sound spec: only tracing finds that a sealed white room never grows dark."""
+    glb, spec = closed_box(1.0, 1.0)
+    (tmp_path / "white.glb").write_bytes(glb)
+    with server.client() as client:
+        job = client.submit(client.add_scene(tmp_path / "white.glb").digest, spec)
+        with pytest.raises(JobFailed) as caught:
+            client.wait(job).check()
+    assert (caught.value.slug, caught.value.exit_code) == ("scene.light_never_ends", 2)
 
 
 def test_nobody_there() -> None:

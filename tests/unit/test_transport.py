@@ -16,6 +16,8 @@ from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.scene import Camera, Scene
 from bake_core.spec import parse_spec
+from bake_core.stability.scenes import box_with_hole
+from bake_core.stability.scenes import scene as glb_of
 from tests.scenes import QUAD, SQUARE, add_square, build, camera_at, icosphere, load, polygon_irradiance, sky
 from tests.unit.gltf_build import load_glb
 
@@ -131,26 +133,12 @@ def test_roulette_is_unbiased_in_a_furnace(tmp_path: Path, albedo: float, seeds:
     assert found.std(ddof=1) / expected < 2 * 0.1 / math.sqrt(8 * 256)
 
 
-def box_with_a_window(albedo: float) -> GlbWriter:
-    """A box of 2 m, its fronts inside, with a window of 0.8 × 0.8 m in the middle of its ceiling."""
-    w = GlbWriter()
-    wall = w.material("wall", (albedo,) * 3)
-    corner = np.array([[(-1, 1)[i >> a & 1] for a in range(3)] for i in range(8)], np.float64)
-    sides = [corner[list(s)] for s in ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (0, 1, 3, 2), (4, 6, 7, 5))]
-    h = 0.4
-    edges = [(-1, -h, -1, 1), (h, 1, -1, 1), (-h, h, -1, -h), (-h, h, h, 1)]
-    sides += [np.array([[x0, 1, z0], [x1, 1, z0], [x1, 1, z1], [x0, 1, z1]], np.float64) for x0, x1, z0, z1 in edges]
-    indices = np.concatenate([QUAD + 4 * i for i in range(len(sides))])
-    w.node("box", mesh=w.mesh("box", [Part(np.concatenate(sides), indices, material=wall)]))
-    return w
-
-
 PROBES = {"name": "box", "origin": [-0.55, -0.45, -0.6], "spacing": [1.0, 1.0, 1.0], "counts": [2, 2, 2]}
 
 
 def test_white_and_nearly_closed_under_a_white_sky() -> None:
     """Albedo exactly 1: radiance is 1 everywhere, though a path takes 40 vertices to find the window."""
-    scene = load(box_with_a_window(1.0))
+    scene = load_example(glb_of(box_with_hole(0.4), 1.0))
     found = means_over_seeds(scene, {"volumes": [PROBES], "environment": sky()}, 4, 12)
     assert_mean(found, math.pi, within=0.02)
 

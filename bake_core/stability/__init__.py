@@ -1,0 +1,1 @@
+"""Stiff and extreme cases with known answers, and the one call that runs them."""
