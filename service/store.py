@@ -15,6 +15,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
+from bake_core.errors import MachineError
 from service.jobs import FINISHED, TRANSITIONS, Event, IllegalTransition, Job, Kind, Pass, Shard, State
 
 # SQLite's writers wait for each other this long; the longest transaction here takes milliseconds.
@@ -104,6 +105,20 @@ class Store:
             sa.event.listen(self.engine, "connect", _open_sqlite)
             sa.event.listen(self.engine, "begin", _begin_sqlite)
         metadata.create_all(self.engine)
+        self._check_columns()
+
+    def _check_columns(self) -> None:
+        """Refuse the tables of another version, rather than fail at the first job."""
+        there = sa.inspect(self.engine)
+        for table in metadata.sorted_tables:
+            missing = {c.name for c in table.columns} - {c["name"] for c in there.get_columns(table.name)}
+            if missing:
+                raise MachineError(
+                    "service.other_version",
+                    f"the table {table.name!r} lacks {', '.join(sorted(missing))}: another version of octobake made it; "
+                    "give --data (or --database) a new place",
+                    self.engine.url.render_as_string(hide_password=True),
+                )
 
     def close(self) -> None:
         """Close every connection; SQLite folds its log back into the file."""

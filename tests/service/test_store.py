@@ -8,7 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
+from bake_core.errors import MachineError
 from service.jobs import FINISHED, TRANSITIONS, IllegalTransition, Kind, State
 from service.store import Store
 
@@ -94,3 +96,15 @@ def test_what_is_committed_is_on_the_disk(store: Store) -> None:
     with store._read() as c:
         assert c.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert c.exec_driver_sql("PRAGMA synchronous").scalar() == 2, "FULL"
+
+
+def test_tables_of_another_version_are_refused(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'jobs.sqlite'}"
+    store = Store(url)
+    with store.engine.begin() as c:
+        c.execute(sa.text("ALTER TABLE passes DROP COLUMN rays"))
+    store.close()
+    with pytest.raises(MachineError) as caught:
+        Store(url)
+    assert caught.value.slug == "service.other_version"
+    assert "rays" in caught.value.message and "jobs.sqlite" in caught.value.where
