@@ -86,6 +86,11 @@ class Compute:
         """Run a function on a worker; every call is its own task, even with the same arguments."""
         return self._client.submit(function, *arguments, key=f"{function.__name__}-{uuid4().hex}", pure=False)
 
+    def places(self, keys: list[str]) -> dict[str, str]:
+        """Which worker the scheduler has given each of these tasks to; those that wait in its queue are left out."""
+        found = self._client.processing()
+        return {key: address for address, tasks in found.items() for key in map(str, tasks) if key in keys}
+
     def cancel(self, futures: list[Future[Any]]) -> None:
         """Drop tasks that wait, and raise the cancel flag of those that run."""
         self._client.cancel(futures, force=True)
@@ -95,6 +100,8 @@ class Compute:
         log.warning("restarting the worker at %s, which does not stop", address)
         if self._worker:
             self._worker.kill()
+            # Until the scheduler, asked again, knows of the next one.
+            self._known_slots, self._asked_slots_at = 0, time.monotonic()
         else:
             # Where it has no nanny, the task runs on, and the worker is free when it ends.
             with suppress(ValueError):

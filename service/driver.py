@@ -35,8 +35,8 @@ from service.store import Store
 log = logging.getLogger("octobake.driver")
 
 # A task that has not ended this long after its cancel is in native code that polls no flag (building, compiling, Vulkan): its worker is
-# killed, so that the CPU is free within the second that is promised.
-STOP_SECONDS = 0.5
+# killed, so that the CPU is free within the second that is promised, on a busy machine too.
+STOP_SECONDS = 0.3
 # Before the first shard has been timed: paths a second on one thread, on the slow side, so that first shards are rather short.
 FIRST_GUESS_RATE = 200_000.0
 
@@ -277,9 +277,11 @@ class Driver:
 
     def _halt(self, running: dict[str, tuple[_Piece, Future[Any]]], begun: dict[str, str], wait: bool) -> None:
         """Stop what runs, and see to it that it has stopped."""
+        # Where each piece runs; None where it has begun nowhere yet. What holds the interpreter from its first line on (a cold compiler, a
+        # parser) has not come to say so itself, hence the scheduler's word.
+        unheard = self._compute.places(list(running)) | begun if wait else {}
+        unheard = {key: unheard.get(key) for key in running}
         self._compute.cancel([future for _, future in running.values()])
-        # Where each piece runs; None where it has not said so yet, though it may have begun.
-        unheard = {key: begun.get(key) for key in running}
         deadline = time.monotonic() + STOP_SECONDS
         while wait and unheard and (left := deadline - time.monotonic()) > 0:
             try:
