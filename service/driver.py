@@ -279,8 +279,8 @@ class Driver:
         """Stop what runs, and see to it that it has stopped."""
         # Where each piece runs; None where it has begun nowhere yet. What holds the interpreter from its first line on (a cold compiler, a
         # parser) has not come to say so itself, hence the scheduler's word.
-        unheard = self._compute.places(list(running)) | begun if wait else {}
-        unheard = {key: unheard.get(key) for key in running}
+        known = self._compute.places(list(running)) | begun if wait else {}
+        unheard = {key: known.get(key) for key in running}
         self._compute.cancel([future for _, future in running.values()])
         deadline = time.monotonic() + STOP_SECONDS
         while wait and unheard and (left := deadline - time.monotonic()) > 0:
