@@ -23,12 +23,16 @@ class Future:
 
 
 class Compute:
-    """One slot; remembers which workers it was told to restart."""
+    """One slot; remembers which workers it was told to restart. Its scheduler has given tasks to `placed`."""
 
     slots = 1
 
-    def __init__(self) -> None:
+    def __init__(self, placed: dict[str, str]) -> None:
+        self.placed = placed
         self.restarted: list[str] = []
+
+    def places(self, keys: list[str]) -> dict[str, str]:
+        return self.placed
 
     def submit(self, *call: Any) -> Future:
         return Future()
@@ -40,12 +44,15 @@ class Compute:
         self.restarted.append(address)
 
 
-@pytest.mark.parametrize(("news", "restarted"), [(["began"], ["a"]), (["began", "ended"], []), ([], [])])
+@pytest.mark.parametrize(
+    ("news", "placed", "restarted"),
+    [(["began"], {}, ["a"]), (["began", "ended"], {"task": "a"}, []), ([], {}, []), ([], {"task": "a"}, ["a"])],
+)
 def test_a_task_that_begins_as_it_is_cancelled_is_stopped_too(
-    news: list[str], restarted: list[str], service: Service, monkeypatch: pytest.MonkeyPatch
+    news: list[str], placed: dict[str, str], restarted: list[str], service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(driver, "STOP_SECONDS", 0.05)
-    compute: Any = Compute()
+    compute: Any = Compute(placed)
     job = service.store.add_job(Kind.BAKE, {}, {}, 0)
     it = Driver(job, service.settings, service.store, service.blobs, compute, service.hub)
     it.cancel()
