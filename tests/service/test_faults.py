@@ -241,7 +241,7 @@ def test_a_job_survives_its_service(end: str, make_server: Make, scene: Path, bo
 
     server.start()
     # Shards are traced in order: once there is one more, those that were there would have been overwritten.
-    wait_for(lambda: len(shard_files(server, running)) > len(committed), 60)
+    wait_for(lambda: len(committed_files(server, running)) > len(committed), 60)
     assert committed.items() <= shard_files(server, running).items(), "what was committed is not traced again"
     with server.client() as client:
         waiting.join(60)
@@ -256,18 +256,18 @@ def test_a_job_survives_its_service(end: str, make_server: Make, scene: Path, bo
     assert not leftovers(server)
 
 
-def committed_files(server: Server, job: Bake) -> dict[str, tuple[int, int]]:
-    """Those of them that the job store names: a kill may fall between a file and its row, and such a shard is rightly traced again."""
-    with closing(sqlite3.connect(server.data / "octobake.sqlite")) as store:
-        named = {row[0].partition("@")[0] for row in store.execute("SELECT tally FROM shards WHERE job = ?", (job.id,))}
-    return {name: file for name, file in shard_files(server, job).items() if name in named}
-
-
 def shard_files(server: Server, job: Bake) -> dict[str, tuple[int, int]]:
     """The stored sums of the last pass's shards: which file each is, and since when."""
     folder = server.data / "blobs" / "work" / job.id
     last = max(int(p.name.split("-")[1]) for p in folder.glob("pass-*-shard-*"))
     return {p.name: (p.stat().st_ino, p.stat().st_mtime_ns) for p in folder.glob(f"pass-{last}-shard-*")}
+
+
+def committed_files(server: Server, job: Bake) -> dict[str, tuple[int, int]]:
+    """Those of them that the job store names: a kill may fall between a file and its row, and such a shard is rightly traced again."""
+    with closing(sqlite3.connect(server.data / "octobake.sqlite")) as store:
+        named = {row[0].partition("@")[0] for row in store.execute("SELECT tally FROM shards WHERE job = ?", (job.id,))}
+    return {name: file for name, file in shard_files(server, job).items() if name in named}
 
 
 def test_a_cluster_of_somebody_else_s(make_server: Make, scene: Path, tmp_path: Path, expected: dict[str, str]) -> None:
