@@ -173,7 +173,7 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
         if output == "irradiance":
             # The covariance term is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard
             # error.
-            mean = np.maximum(state.irradiance[probes].sum(1) / state.samples, 0)
+            mean = np.maximum(state.mean()[probes], 0)
             return np.asarray(mean, np.float32).reshape(-1, selection.irradiance, selection.irradiance, 3)
         return np.asarray(state.radiance[probes] / state.samples, np.float32).reshape(-1, selection.capture, selection.capture, 3)
 

@@ -86,9 +86,8 @@ def _places(volumes: Sequence[VolumeData], count: int) -> F64:
     """Probe positions spread over the volumes, (at most `count`, 3), of those that see the fewest back faces."""
     positions, backs = [], []
     for v in volumes:
-        lattice = np.stack(np.unravel_index(np.arange(len(v.states)), tuple(v.counts[::-1]))[::-1], -1)
         usable = v.states > 0 if v.states.any() else np.ones(len(v.states), bool)
-        positions.append((v.origin + v.spacing * lattice + v.offsets)[usable])
+        positions.append(v.positions()[usable])
         backs.append(v.backface[usable])
     position, back = np.concatenate(positions), np.concatenate(backs)
     # A probe that sees back faces stands behind something single-sided, outside of what is to be looked at.

@@ -87,6 +87,12 @@ class VolumeData:
     distance_limit: float
     atlases: dict[str, Atlas]
 
+    def positions(self) -> F64:
+        """Where the probes stand, offsets included: (n, 3) float64, world, in flat order."""
+        lattice = np.stack(np.unravel_index(np.arange(len(self.states)), tuple(self.counts[::-1]))[::-1], -1)
+        out: F64 = self.origin + self.spacing * lattice + self.offsets
+        return out
+
 
 @dataclass(frozen=True)
 class Bundle:

@@ -16,15 +16,14 @@ import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
-from bake_core.embree import intersect1, new_rayhit, rays_traced, set_ray
+from bake_core.embree import new_rayhit, rays_traced
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import either, entry_kernel, kernel
 from bake_core.next_event import sample_emitter
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
-from bake_core.surfaces import MAX_PASSED, blocked, surface
-from bake_core.textures import lets_through
+from bake_core.surfaces import INFINITE, blocked, find_surface, surface
 from bake_core.tracer import Tracer
 from bake_core.transport import trace_path
 
@@ -41,10 +40,7 @@ BLOCKS = 4
 _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
-_INFINITE = np.float32(np.inf)
 _CANCELLED, _DONE = 1, 0
-# geomID of a ray that has met nothing.
-_NOTHING = 0xFFFFFFFF
 
 
 @kernel
@@ -68,7 +64,7 @@ def _capture_density(d, texels):  # type: ignore[no-untyped-def]
 
 def _add_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes):  # type: ignore[no-untyped-def]
     radiance, d, pdf = sample_sky(t.sky, np.float64(u), np.float64(v))
-    if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], d[0], d[1], d[2], _INFINITE):
+    if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], d[0], d[1], d[2], INFINITE):
         _add_light(1 / (_capture_density(d, texels) + rate * pdf), radiance, d, normals, lanes)
     return True
 
@@ -242,20 +238,12 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
             normal[p, i, 0] = normal[p, i, 1] = normal[p, i, 2] = 0
             back[p, i] = False
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
-            for _ in range(MAX_PASSED):
-                set_ray(ray, ray_bits, x, y, z, dx, dy, dz, _INFINITE)
-                intersect1(t.handle, ray.ctypes.data, 0)
-                if ray_bits[18] == _NOTHING:
-                    break
-                point, n, epsilon, _, material, front, triangle, b1, b2, _ = surface(t, ray_bits, ray, dx, dy, dz)
-                if not lets_through(t, material, triangle, b1, b2, ray_bits):
-                    x, y, z = point[0] - positions[p, 0], point[1] - positions[p, 1], point[2] - positions[p, 2]
-                    distance[p, i] = math.sqrt(x * x + y * y + z * z)
-                    normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
-                    back[p, i] = not front and not t.materials.double_sided[material]
-                    break
-                # Go on from the far side: the normal looks back at us.
-                x, y, z = point[0] - epsilon * n[0], point[1] - epsilon * n[1], point[2] - epsilon * n[2]
+            if find_surface(t, ray, ray_bits, x, y, z, dx, dy, dz):
+                point, n, _, _, material, front, _, _, _, _ = surface(t, ray_bits, ray, dx, dy, dz)
+                x, y, z = point[0] - x, point[1] - y, point[2] - z
+                distance[p, i] = math.sqrt(x * x + y * y + z * z)
+                normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
+                back[p, i] = not front and not t.materials.double_sided[material]
     return _DONE
 
 

@@ -101,16 +101,23 @@ def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
 def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.bool_]:
     """Whether each point (n, 3) is within half a spacing of a volume's box: where a bundle's light can be held against the truth.
 
-    Farther out, the nearest cell answers, which is defined but no more than a guess. The spacing is the longest of the three: along that
-    side a cell answers for points as far from its probes.
+    Farther out, the nearest cell answers, which is defined but no more than a guess.
     """
     positions = np.asarray(positions, np.float64)
     out = np.zeros(len(positions), np.bool_)
     for volume in volumes:
         last = volume.origin + volume.spacing * (np.asarray(volume.counts) - 1)
         beyond = np.maximum(volume.origin - positions, positions - last)
-        out |= (beyond <= volume.spacing.max() / 2).all(-1)
+        out |= (beyond <= cover(volume)).all(-1)
     return out
+
+
+def cover(volume: VolumeData) -> float:
+    """How far beyond its outermost probes a volume answers for points, metres.
+
+    Half of its longest spacing: along that side, its cells answer for points as far from their probes.
+    """
+    return float(volume.spacing.max()) / 2
 
 
 def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:

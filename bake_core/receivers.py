@@ -20,16 +20,16 @@ from numba import uint32, uint64
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.embree import intersect1, new_rayhit, set_ray
+from bake_core.embree import new_rayhit
 from bake_core.errors import Cancelled
+from bake_core.irradiance import cover
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.materials import sample_lambert
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.scene import Scene
 from bake_core.surface_sampling import Places, SurfaceSampler
-from bake_core.surfaces import MAX_PASSED, blocked, surface
+from bake_core.surfaces import INVALID, blocked, find_surface, surface
 from bake_core.tally import BACKFACE_LIMIT
-from bake_core.textures import lets_through
 from bake_core.tracer import Tracer
 
 F64 = NDArray[np.float64]
@@ -43,7 +43,6 @@ _MOST_DRAWS = 16
 # A wall half a spacing from the outermost probes belongs to the volume, whichever way its coordinates are rounded: this much of a cell.
 _SLACK = 1e-5
 _KEPT, _BEHIND, _UNSEEN, _CANCELLED = 0, 1, 2, 3
-_NOTHING = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def volume_boxes(volumes: Sequence[VolumeData]) -> F64:
     """Where a bundle's light can be held against the truth, (v, 2, 3), world: as :func:`bake_core.irradiance.covered` has it."""
     boxes = []
     for v in volumes:
-        reach = v.spacing.max() / 2 + _SLACK * v.spacing
+        reach = cover(v) + _SLACK * v.spacing
         boxes.append([v.origin - reach, v.origin + (v.counts - 1) * v.spacing + reach])
     return np.array(boxes).reshape(-1, 2, 3)
 
@@ -172,9 +171,7 @@ def _probe_table(volumes: Sequence[VolumeData], origin: F64) -> _Probes:
     first = np.cumsum([0] + [len(v.states) for v in volumes])
     positions, active = np.empty((first[-1], 3)), np.empty(first[-1], np.bool_)
     for v, start, end in zip(volumes, first[:-1], first[1:], strict=True):
-        k, j, i = np.meshgrid(*(np.arange(n) for n in v.counts[::-1]), indexing="ij")
-        lattice = np.stack([i, j, k], -1).reshape(-1, 3)
-        positions[start:end] = v.origin + lattice * v.spacing + v.offsets - origin
+        positions[start:end] = v.positions() - origin
         active[start:end] = v.states == 1
     return _Probes(grids, counts, first, positions, active)
 
@@ -189,7 +186,7 @@ def stand_on(t, ray, ray_bits, places, i):  # type: ignore[no-untyped-def]
         Point, geometric and shading normal, how far to leave the surface, material.
     """
     ray[15], ray[16] = places.barycentrics[i, 0], places.barycentrics[i, 1]
-    ray_bits[17], ray_bits[18], ray_bits[19] = places.triangles[i], places.items[i], _NOTHING
+    ray_bits[17], ray_bits[18], ray_bits[19] = places.triangles[i], places.items[i], INVALID
     p, n, epsilon, _, material, _, _, _, _, _ = surface(t, ray_bits, ray, 0.0, 0.0, 0.0)
     # Without a direction every hit is taken for one from behind, and the normals are turned round.
     if not places.back[i]:
@@ -237,19 +234,12 @@ def _inspect(t, ray, places, probes, seed, cancelled, found, materials, verdicts
             u, v = sobol_pair(reverse_bits(uint32(k)), key)
             dx, dy, dz = sample_lambert(u, v, n)
             x, y, z = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-            for _ in range(MAX_PASSED):
-                set_ray(ray, ray_bits, x, y, z, dx, dy, dz, np.float32(np.inf))
-                intersect1(t.handle, ray.ctypes.data, 0)
-                if ray_bits[18] == _NOTHING:
-                    break
-                q, m, offset, _, hit, front, triangle, b1, b2, _ = surface(t, ray_bits, ray, dx, dy, dz)
-                if not lets_through(t, hit, triangle, b1, b2, ray_bits):
-                    if not front and not t.materials.double_sided[hit]:
-                        behind += 1
-                    elif not seen:
-                        seen = _sees_a_probe(t, ray, ray_bits, q, m, offset, probes)
-                    break
-                # Go on from the far side: the normal looks back at us.
-                x, y, z = q[0] - offset * m[0], q[1] - offset * m[1], q[2] - offset * m[2]
+            if not find_surface(t, ray, ray_bits, x, y, z, dx, dy, dz):
+                continue
+            q, m, offset, _, hit, front, _, _, _, _ = surface(t, ray_bits, ray, dx, dy, dz)
+            if not front and not t.materials.double_sided[hit]:
+                behind += 1
+            elif not seen:
+                seen = _sees_a_probe(t, ray, ray_bits, q, m, offset, probes)
         verdicts[i] = _BEHIND if behind >= BACKFACE_LIMIT * _RAYS else _KEPT if seen else _UNSEEN
     return 0

@@ -64,10 +64,11 @@ def write(folder: Path, manifest: dict[str, Any], digest: str, run: Run) -> None
         "rate": rate_json(run),
     }
     plot = error_plot(run.curve, manifest["error"]["target"], by_samples, by_seconds, run.began)
+    svg = as_svg(plot)
     (folder / "report.json").write_bytes(dump_json(document))
-    (folder / "report.svg").write_text(as_svg(plot), encoding="utf-8")
+    (folder / "report.svg").write_text(svg, encoding="utf-8")
     write_drawing(folder / "report.png", plot)
-    (folder / "report.html").write_text(_page(manifest, document, run, as_svg(plot)), encoding="utf-8")
+    (folder / "report.html").write_text(_page(manifest, document, run, svg), encoding="utf-8")
 
 
 def rate_json(run: Run) -> dict[str, Any]:

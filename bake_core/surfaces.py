@@ -129,6 +129,24 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def find_surface(t, ray, ray_bits, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Whether a ray meets a surface, behind whatever it goes through where that is cut out; :func:`surface` then says which."""
+    for _ in range(MAX_PASSED):
+        set_ray(ray, ray_bits, x, y, z, dx, dy, dz, INFINITE)
+        intersect1(t.handle, ray.ctypes.data, 0)
+        if ray_bits[18] == INVALID:
+            return False
+        if not has_holes(t):
+            return True
+        p, n, epsilon, _, material, _, triangle, b1, b2, _ = surface(t, ray_bits, ray, dx, dy, dz)
+        if not lets_through(t, material, triangle, b1, b2, ray_bits):
+            return True
+        # Go on from the far side: the normal looks back at us.
+        x, y, z = p[0] - epsilon * n[0], p[1] - epsilon * n[1], p[2] - epsilon * n[2]
+    return False
+
+
+@kernel
 def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-untyped-def]
     """Whether anything lies between a point and the light: any hit, or hit after hit where something in the scene is cut out."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)

@@ -117,6 +117,18 @@ class State(_Bytes):
         """(n,) bool: probes that stand outside geometry."""
         return self.backface < BACKFACE_LIMIT
 
+    def mean(self) -> F64:
+        """(n, m, 3) irradiance of every texel."""
+        mean: F64 = self.irradiance.sum(1) / self.samples
+        return mean
+
+    def scramble_means(self) -> F64:
+        """(n, scrambles, m, 3) what each scramble alone says of it; NaN where it has had no sample."""
+        scrambles = self.irradiance.shape[1]
+        drawn = np.array([-(-(self.samples - i) // scrambles) for i in range(scrambles)], np.float64)
+        with np.errstate(invalid="ignore"):
+            return self.irradiance / drawn[:, None, None]
+
     def error(self) -> float | None:
         """DESIGN's error figure; None while it cannot be measured."""
         return relative_error(self.irradiance, self.samples, self.active())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bake_core.comparison import LUMINANCE
 from bake_core.images import write_exr, write_png
+from bake_core.textures import linear_to_srgb
 
 F32 = NDArray[np.float32]
 
@@ -51,8 +52,7 @@ def exposure_for(reference: F32) -> float:
 
 def display(radiance: F32, exposure: float) -> NDArray[np.uint8]:
     """Radiance as sRGB bytes (IEC 61966-2-1)."""
-    x = np.clip(radiance.astype(np.float64) * exposure, 0, 1)
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    encoded = linear_to_srgb(np.clip(radiance.astype(np.float64) * exposure, 0, 1))
     return np.asarray(np.rint(encoded * 255), np.uint8)
 
 

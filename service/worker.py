@@ -129,6 +129,7 @@ def verify(work: Work, bundle: str, request: Mapping[str, Any]) -> dict[str, Any
             samples=request["samples"],
             threads=work.own_threads,
             thresholds=parse_thresholds(request["thresholds"]) if "thresholds" in request else None,
+            find=find_stored(blobs),
             progress=task.report,
             cancelled=task.flag,
         )

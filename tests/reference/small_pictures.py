@@ -15,7 +15,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
 from bake_core.lights import merge_lights
 from bake_core.picture import Picture, path_trace_picture
-from bake_core.raster import Rasterizer
+from bake_core.raster import PIXEL_SAMPLES, Rasterizer
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
 from bake_core.textures import texture_table
@@ -50,17 +50,19 @@ def constant_volume(irradiance: Sequence[float]) -> VolumeData:
     return volume
 
 
-def raster(scene: Scene, spec: Spec, camera: Camera, volume: VolumeData, width: int = 96, height: int = 54) -> Picture:
+def raster(
+    scene: Scene, spec: Spec, camera: Camera, volume: VolumeData, width: int = 96, height: int = 54, frames: int = PIXEL_SAMPLES
+) -> Picture:
     with Device() as device:
         rasterizer = Rasterizer(device, scene, merge_lights(scene, spec), surroundings(spec).constant, [volume], texture_table(scene))
-        return rasterizer.render(camera, width, height)
+        return rasterizer.render(camera, width, height, samples=frames)
 
 
 def eye(position: Sequence[float], target: Sequence[float], yfov: float = 0.9) -> Camera:
     return Camera("eye", looking(position, target), yfov)
 
 
-def both(scene: Scene, spec: Spec, camera: Camera, samples: int = 256) -> tuple[Picture, Picture]:
+def both(scene: Scene, spec: Spec, camera: Camera, samples: int = 256, frames: int = PIXEL_SAMPLES) -> tuple[Picture, Picture]:
     tracer = Tracer.build(scene, spec, surroundings(spec))
     traced = path_trace_picture(tracer, camera, 96, 54, samples=samples, seed=3, max_bounces=1, threads=THREADS)
-    return raster(scene, spec, camera, constant_volume((0, 0, 0))), traced
+    return raster(scene, spec, camera, constant_volume((0, 0, 0)), frames=frames), traced

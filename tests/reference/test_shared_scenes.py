@@ -25,14 +25,6 @@ def baked(shared: Path, folder: Path, name: str, **changes: Any) -> Bundle:
     return read_bundle(folder / name)
 
 
-def positions(bundle: Bundle) -> Array:
-    """(n, 3) world positions of the first volume's probes, in flat order."""
-    v = bundle.volumes[0]
-    k, j, i = np.meshgrid(*(np.arange(n) for n in v.counts[::-1]), indexing="ij")
-    out: Array = v.origin + np.stack([i, j, k], -1).reshape(-1, 3) * v.spacing
-    return out
-
-
 def test_rtxgi_furnace(shared: Path, tmp_path: Path) -> None:
     """A white slab under a white sky: radiance is 1 in every direction, irradiance π at every probe, those below the slab included."""
     bundle = baked(shared, tmp_path, "rtxgi_furnace")
@@ -48,7 +40,7 @@ def test_rtxgi_two_rooms(shared: Path, tmp_path: Path) -> None:
     """The closed room is exactly dark, the open one is lit through its door, and probes under the ground see back faces."""
     bundle = baked(shared, tmp_path, "rtxgi_two_rooms", stop={"target_error": None, "max_samples": 4})
     texels, backface = maps(bundle), bundle.volumes[0].backface
-    x, y, z = positions(bundle).T
+    x, y, z = bundle.volumes[0].positions().T
     tall = (x > -96) & (x < 96) & (y > 0) & (y < 46)
     closed, opened, below = tall & (z > -96) & (z < -2), tall & (z > 2) & (z < 96), y < 0
     assert closed.sum() > 200 and opened.sum() > 200 and below.sum() > 500

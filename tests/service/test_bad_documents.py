@@ -23,25 +23,15 @@ from service.settings import Settings
 from tests.faults.__main__ import summary
 from tests.faults.corpus import changed
 from tests.faults.documents import SKY, SPEC, BundleFault, DocumentFault, bundles, documents
+from tests.service.leftovers import listing, own_temporary_files
 from tests.service.running import InProcess
+
+__all__ = ["own_temporary_files"]
 
 FAULTS, BUNDLES = documents(), bundles()
 ROOT = Path(__file__).resolve().parents[2]
 # What a request's own JSON is called, and where in it each kind of document goes.
 PLACES = {"spec": "spec", "cameras": "body.cameras", "thresholds": "body.thresholds"}
-
-
-def listing(folder: Path) -> list[Path]:
-    return sorted(folder.rglob("*"))
-
-
-@pytest.fixture(autouse=True)
-def own_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert not listing(folder)
 
 
 @pytest.fixture(scope="module")

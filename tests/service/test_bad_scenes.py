@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,14 +13,13 @@ from service.cli import main
 from service.parts import Service
 from service.settings import Settings
 from tests.faults.corpus import Fault, corpus
+from tests.service.leftovers import listing, own_temporary_files
 from tests.service.running import InProcess
+
+__all__ = ["own_temporary_files"]
 
 FAULTS = corpus()
 SPEC = {"volumes": [{"origin": [0, 0, 0], "spacing": [1, 1, 1], "counts": [1, 1, 1]}]}
-
-
-def listing(folder: Path) -> list[Path]:
-    return sorted(folder.rglob("*"))
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +29,6 @@ def shared_http(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[InPr
     service = Service(Settings(data=str(tmp_path_factory.mktemp("bad") / "data")))
     yield InProcess(create_app(service)), service
     service.close()
-
-
-@pytest.fixture(autouse=True)
-def own_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Whatever is unpacked or decoded on the way is gone again."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert not listing(folder)
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.name[:60])

@@ -15,6 +15,7 @@ from octobake_client.sse import parse
 
 from bake_core.bundle import read_bundle
 from bake_core.examples import closed_box, cornell
+from tests.pavilion import SKY, pavilion_spec, write_pavilion
 from tests.service.running import Server, box_spec, octobake
 
 
@@ -202,6 +203,21 @@ def test_a_cornell_box_is_baked_through_the_service_and_its_picture_holds(server
         assert any(name.endswith(".exr") for name in files)
         with zipfile.ZipFile(client.fetch(bake, tmp_path / "cornell.zip")) as archive:
             assert json.loads(archive.read("manifest.json"))["scene"]["digest"] == bake.scene
+
+
+def test_a_bake_under_a_stored_sky_is_verified_under_it(server: Server, tmp_path: Path) -> None:
+    """With all that a scene can hold: the worker finds the image where the bake found it."""
+    path = write_pavilion(tmp_path)
+    with server.client() as client:
+        spec = pavilion_spec(client.put_blob(tmp_path / SKY), stop={"target_error": None, "max_samples": 4})
+        bake = client.wait(client.submit(client.add_scene(path).digest, spec)).check()
+        anything: dict[str, Any] = {"indirect": {}, "whole": {"mean_ratio": [0.5, 2]}}
+        verification = client.wait(client.verify(bake, width=32, height=18, samples=2, thresholds=anything)).check()
+    assert verification.result
+    report = verification.result["report"]
+    assert report["failures"] == []
+    # Somewhere the sky itself is seen.
+    assert any(camera["surface"] < 1 for camera in report["cameras"])
 
 
 def test_a_verification_that_fails_its_thresholds_has_succeeded_with_exit_code_5(server: Server, box: Path) -> None:
