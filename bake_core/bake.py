@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
 from bake_core.assemble import assemble
+from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
 from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, decide, fit_pass, next_pass
@@ -192,9 +193,11 @@ def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
         return sums.astype(np.float32)
 
 
-def compile_kernels(prepared: Prepared) -> None:
-    """Compile, or fetch from the cache on disk, every kernel that a bake runs: by tracing no probe at all."""
+def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
+    """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
+    if audited:
+        compile_audit(prepared.scene, prepared.tracer)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -292,8 +295,25 @@ def gather(
     return state
 
 
-def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, Any]:
-    """Write the bundle: atlases, shaders, manifest, report; all or nothing.
+def finish(
+    prepared: Prepared,
+    state: State,
+    run: Run,
+    out: Path,
+    *,
+    audit_seconds: float | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> dict[str, Any]:
+    """Write the bundle: atlases, shaders, manifest, an audit of them, report; all or nothing.
+
+    Parameters
+    ----------
+    run : Run
+        Its audit is filled in.
+    audit_seconds : float, optional
+        What the audit may take; 3 % of the bake where left out. 0: no audit.
+    cancelled : (1,) uint8, optional
+        Set it to 1 from any thread: the audit ends, and the report has none.
 
     Returns
     -------
@@ -313,11 +333,24 @@ def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, A
             manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)
+            allowed = DEFAULT_SHARE * run.seconds if audit_seconds is None else audit_seconds
+            if audit_seconds != 0:
+                run.audit = _audit(prepared, state, work, allowed, run.threads, cancelled)
             report.write(work, manifest, bundle.content_digest(written), run)
             bundle.publish(work, out)
     except OSError as e:
         raise MachineError("machine.cannot_write", f"{e.strerror or e}; is there room on the disk?", str(out)) from e
     return manifest
+
+
+def _audit(prepared: Prepared, state: State, work: Path, seconds: float, threads: int, cancelled: NDArray[np.uint8] | None) -> Audit | None:
+    """Of what has just been written; None where somebody has no more time for it."""
+    volumes = bundle.read_bundle(work).volumes
+    baked = Baked(prepared.scene, prepared.spec, prepared.tracer, state, volumes, prepared.positions, prepared.limits)
+    try:
+        return audit(baked, seconds, threads=threads, cancelled=cancelled)
+    except Cancelled:
+        return None
 
 
 @dataclass(frozen=True)
@@ -338,6 +371,7 @@ def bake(
     shards: int = 1,
     find: Find = no_images,
     adaptive: bool = True,
+    audit_seconds: float | None = None,
     progress: ProgressCallback | None = None,
     point: Callable[[Point], None] = lambda point: None,
     cancelled: NDArray[np.uint8] | None = None,
@@ -356,6 +390,8 @@ def bake(
         Where an image that the spec names lies.
     adaptive : bool
         Whether easy probes may get fewer samples, where there is an error to reach (:mod:`bake_core.allocation`).
+    audit_seconds : float, optional
+        As :func:`finish` has it.
     point : callable, optional
         Told each point of the curve of error against time as it is measured.
     cancelled : (1,) uint8, optional
@@ -376,14 +412,14 @@ def bake(
     clock.stage("building")
     prepared = prepare(scene, spec, find)
     clock.stage("compiling")
-    compile_kernels(prepared)
+    compile_kernels(prepared, audited=audit_seconds != 0)
     clock.stage("tracing")
     check_finite(prepared, threads=threads, cancelled=cancelled)
     run = Run(threads, shards, began=clock.elapsed)
     state = gather(prepared, run, clock, adaptive=adaptive, point=point, cancelled=cancelled)
     clock.stage("writing")
     run.seconds, run.stages = clock.elapsed, clock.stages()
-    manifest = finish(prepared, state, run, out)
+    manifest = finish(prepared, state, run, out, audit_seconds=audit_seconds, cancelled=cancelled)
     return BakeResult(manifest, run, met(spec, run))
 
 

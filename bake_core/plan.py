@@ -88,7 +88,7 @@ def _paths_per_second(prepared: Prepared, threads: int) -> float:
     """Measured over probes spread evenly through the bake."""
     n = prepared.probe_count
     chosen = np.unique(np.linspace(0, n - 1, min(_PILOT_PROBES, n)).astype(int))
-    compile_kernels(prepared)
+    compile_kernels(prepared, audited=False)
     check_finite(prepared, threads=threads)
     given = Allocation.start(n)
     started = time.perf_counter()

@@ -137,21 +137,21 @@ class State(Stored):
         # Of what is inside a solid nothing is ever shown.
         self.eighths[~active] = 1
 
-    def mean(self, probes: slice = slice(None)) -> F64:
+    def mean(self, probes: slice | I64 = slice(None)) -> F64:
         """(p, m, 3) irradiance of every texel of some probes."""
         weight = np.repeat(self._per_sample()[probes], SCRAMBLES_PER_HALF, 1)
         mean: F64 = np.einsum("psmc,ps->pmc", self.irradiance[probes], weight)
         return mean
 
-    def mean_radiance(self, probes: slice = slice(None)) -> F64:
+    def mean_radiance(self, probes: slice | I64 = slice(None)) -> F64:
         """(p, capture texels, 3) radiance of every texel of some probes; only where it is kept."""
         mean: F64 = np.einsum("phtc,ph->ptc", self.radiance[probes], self._per_sample()[probes])
         return mean
 
-    def scramble_means(self) -> F64:
-        """(n, SCRAMBLES, m, 3) what each scramble alone says of irradiance; NaN where it has had no sample."""
+    def scramble_means(self, probes: slice | I64 = slice(None)) -> F64:
+        """(p, SCRAMBLES, m, 3) what each scramble alone says of some probes' irradiance; NaN where it has had no sample."""
         with np.errstate(invalid="ignore"):
-            return self.irradiance / self._drawn()[..., None, None].astype(np.float64)
+            return self.irradiance[probes] / self._drawn()[probes][..., None, None].astype(np.float64)
 
     def spread(self) -> Spread | None:
         """What the scrambles say of active probes' irradiance; None while not every scramble has had a sample."""

@@ -81,7 +81,7 @@ def compile_kernels(work: Work) -> None:
     """Compile what the scene needs, or fetch it from the cache: its time is no sample's. Then see that the scene has a finite answer."""
     with _task() as task:
         prepared = _prepared(work)
-        bake.compile_kernels(prepared)
+        bake.compile_kernels(prepared, audited=True)
         bake.check_finite(prepared, threads=work.own_threads, cancelled=task.flag)
 
 
@@ -120,10 +120,10 @@ def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> d
 
 def finish(work: Work, state: str, run: Run) -> dict[str, Any]:
     """Filter, encode and pack; answers the digests and sizes of the bundle and of its report."""
-    with _task(), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+    with _task() as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         out = Path(folder) / "bundle.zip"
-        bake.finish(_prepared(work), _state(work, state), run, out)
+        bake.finish(_prepared(work), _state(work, state), run, out, cancelled=task.flag)
         with zipfile.ZipFile(out) as bundle:
             report = Path(bundle.extract("report.json", folder))
         return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report)}
