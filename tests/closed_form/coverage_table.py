@@ -120,7 +120,7 @@ def _courtyard(folder: Path) -> Prepared:
 # Name, scene, target.
 SCENES: tuple[tuple[str, Callable[[Path], Prepared], float], ...] = (
     ("a Cornell box", _cornell, 0.015),
-    ("two rooms, one of them dark", _rooms, 0.002),
+    ("two rooms, one of them dark", _rooms, 0.003),
     ("a pavilion: textures, gloss, cut-outs, sun and sky", _pavilion, 0.02),
     ("a Cornell box under a sky, three bounces", _courtyard, 0.008),
 )
