@@ -177,12 +177,16 @@ class State(Stored):
         return None if found is None else relative_error(found)
 
     def radiance_error(self) -> float | None:
-        """As :meth:`error`, of radiance texels: what two halves say of each; None where radiance is not kept or a half has no sample."""
+        """As :meth:`error`, of radiance texels: what two halves say of each; None where radiance is not kept or a half has no sample.
+
+        A texel counts as one number, not a probe: its paths are its own, and one degree of freedom says little of a few probes.
+        """
         if not self.radiance.size or self.samples < HALVES:
             return None
         active = self.active()
         a, b = np.moveaxis(self.radiance[active] / self.taken[active][:, :, None, None].astype(np.float64), 1, 0)
-        return relative_error(Spread((((a + b) / 2) ** 2).sum(-1), (((a - b) / 2) ** 2).sum(-1), HALVES - 1))
+        square, variance = (((x / 2) ** 2).sum(-1).reshape(-1, 1) for x in (a + b, a - b))
+        return relative_error(Spread(square, variance, HALVES - 1))
 
     def probe_errors(self) -> F64:
         """(n,) float64: each probe's own relative RMS standard error; NaN for inactive ones, and while it cannot be measured."""

@@ -143,6 +143,31 @@ def test_halves_count_alike_whatever_their_numbers_of_samples() -> None:
     assert state.error() == 0  # each half agrees with itself
 
 
+@pytest.mark.parametrize(("probes", "loosest"), [(1, 1.25), (4, 1.15), (50, 1.05)])
+def test_the_bound_of_radiance_holds_95_times_out_of_100(probes: int, loosest: float) -> None:
+    """Two halves that err normally about texels of very different brightness: not less often, nor is the bound loose."""
+    random = np.random.default_rng(1)
+    held, ratio = [], []
+    for _ in range(400):
+        truth = random.exponential(size=(probes, 1, 256, 3))
+        means = truth * (1 + 0.05 * random.normal(size=(probes, HALVES, 256, 1)))
+        state = replace(
+            empty(),
+            samples=32,
+            taken=np.full((probes, HALVES), 16),
+            backface=np.zeros(probes, np.float32),
+            radiance=(16 * means).astype(np.float32),
+        )
+        difference, square = ((means.mean(1) - truth[:, 0]) ** 2).sum(-1), (truth[:, 0] ** 2).sum(-1)
+        error = float(np.sqrt((difference / (square + (0.05 * np.sqrt(square).mean()) ** 2)).mean()))
+        stated = state.radiance_error()
+        assert stated is not None
+        held.append(error <= stated)
+        ratio.append(stated / error)
+    assert np.mean(held) > 0.95 - 3 * (0.05 * 0.95 / 400) ** 0.5
+    assert np.median(ratio) < loosest
+
+
 def test_what_is_not_kept_is_not_added() -> None:
     state = replace(empty(), radiance=NOTHING, distance=np.zeros((0, 0), np.float32))
     state.add([tally((0, PROBES), (0, 16), radiance=False)])
