@@ -175,7 +175,7 @@ def trace_shard(
         seen = {name: values if name == "backface" else values[kept] for name, values in seen.items()}
         spans[~kept, :, 1] = spans[~kept, :, 0]
     else:
-        kept = allocation.eighths[slice(*probes)].any(1)
+        kept = allocation.eighths[slice(*probes)].max(1) > 0
     irradiance, radiance, rays = capture_radiance(
         prepared.tracer,
         np.ascontiguousarray(positions[kept]),
