@@ -41,6 +41,7 @@ PARAMETERS = {
 # flat-wall variances come out negative). Distances are metres of any scale.
 _ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
 
+_BYTES = {"half": 2, "float": 4}
 # As many as anybody would go and look at.
 _WORST_PROBES = 8
 
@@ -61,13 +62,15 @@ def assemble(
         ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
     """
     active = state.active()
-    entries, data = [], []
+    entries, data, saved = [], [], 0
     first = 0
     for volume in volumes:
         probes = slice(first, first + volume.probe_count)
         entry, content = _volume(volume, selection, state, active, probes, folder)
         entries.append(entry)
         data.append(content)
+        inside = volume.probe_count - entry["probes"]["active"]
+        saved += inside * sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
@@ -86,11 +89,20 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [{"what": what, "why": why} for what, why in selection.left_out],
+        "left_out": [{"what": what, "why": why} for what, why in selection.left_out] + _left_out_probes(active, saved),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
     }
+
+
+def _left_out_probes(active: NDArray[np.bool_], saved: int) -> list[dict[str, Any]]:
+    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression."""
+    inside = len(active) - int(active.sum())
+    if not inside:
+        return []
+    why = "inside solids: more than a quarter of what they see are backs of single-sided surfaces"
+    return [{"what": f"{inside} of {len(active)} probes", "why": why, "bytes": saved}]
 
 
 def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State) -> dict[str, Any]:
@@ -125,14 +137,15 @@ def _volume(
     volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path
 ) -> tuple[dict[str, Any], VolumeData]:
     """One volume's files, its entry in the manifest, and what its shaders need to know."""
-    maps = {output: _interior(output, selection, state, probes) for output in selection.outputs}
+    kept = np.flatnonzero(active[probes])
+    maps = {output: _interior(output, selection, state, probes)[kept] for output in selection.outputs}
     tiles = [m.shape[1] + 2 for m in maps.values()]
-    shape = layout(volume.counts, max(tiles))
+    shape = layout(volume.counts, max(tiles), len(kept))
     atlases: dict[str, Atlas] = {}
     described = []
     for output, interior in maps.items():
         if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
-            bad = int(np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0])
+            bad = int(kept[np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0]])
             raise BakeError(
                 "bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}"
             )
@@ -181,7 +194,7 @@ def _volume(
         "probes": {
             "file": probe_file,
             "count": volume.probe_count,
-            "active": int(active[probes].sum()),
+            "active": len(kept),
             "states": active[probes].astype(int).tolist(),
             "offsets": None,
             # Shortest decimals of the float32 values.

@@ -303,12 +303,13 @@ def _volume_of(volumes: Sequence[VolumeData], probes: I64) -> tuple[I64, I64]:
 def _stored(volumes: Sequence[VolumeData], output: str, probes: I64, texels: I64) -> F64:
     """(n, c) float64: texels out of a bundle's atlases, by the bake's probe number and the texel's."""
     of, probe = _volume_of(volumes, probes)
+    tiles = [v.tiles for v in volumes]
     rows = []
     for v, p, texel in zip(of, probe, texels, strict=True):
-        atlas = volumes[v].atlases[output]
+        atlas, tile = volumes[v].atlases[output], int(tiles[v][p])
         row, column = divmod(int(texel), atlas.interior)
-        tile_row, tile_column = divmod(int(p) % (atlas.columns * atlas.rows), atlas.columns)
-        layer = int(p) // (atlas.columns * atlas.rows)
+        tile_row, tile_column = divmod(tile % (atlas.columns * atlas.rows), atlas.columns)
+        layer = tile // (atlas.columns * atlas.rows)
         rows.append(atlas.texels[layer, tile_row * atlas.tile + 1 + row, tile_column * atlas.tile + 1 + column])
     return np.asarray(rows, np.float64)
 
@@ -407,7 +408,7 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
     answers = sample(baked.volumes, receivers.positions[:n], receivers.normals[:n])
     scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volume, answers.probes, answers.weights)
     mean = float(np.sqrt((answers.irradiance**2).sum(-1)).mean())
-    if not np.isfinite(scrambles).all():
+    if baked.state.samples < SCRAMBLES:
         return _figures(answers.irradiance, answers.irradiance, estimates, None, mean, answers.probes[:, 0], paths), None
     ones = np.ones((n, SCRAMBLES), np.int64)
     found = spread(scrambles[:, :, None, :], ones, ones / SCRAMBLES)
@@ -423,6 +424,8 @@ def _answers_of_scrambles(baked: Baked, normals: F64, volumes: I64, probes: I64,
     index = index.reshape(probes.shape)
     side = baked.volumes[0].atlases["irradiance"].interior
     means = baked.state.scramble_means(touched)
+    # Probes inside solids have no samples, and weigh nothing.
+    means[~baked.state.active()[touched]] = 0
     interior = means.reshape(len(touched) * SCRAMBLES, side, side, 3).astype(np.float32)
     shape = layout((len(interior), 1, 1), side + 2)
     atlas = Atlas("irradiance", pack(interior, shape), side + 2, side, shape.columns, shape.rows, shape.layers, "float")

@@ -41,7 +41,7 @@ from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
 from bake_core.selection import Selection, select
 from bake_core.spec import Spec
-from bake_core.tally import State, Tally
+from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
@@ -150,7 +150,7 @@ def trace_shard(
     Parameters
     ----------
     probes, samples : (int, int)
-        Half-open ranges. The pass that starts at sample 0 also captures distances.
+        Half-open ranges. The pass that starts at sample 0 captures distances first: who stands inside a solid is not traced.
     allocation : Allocation
         What each probe of the bake has had before this pass, and what part of it each gets.
     cancelled : (1,) uint8, optional
@@ -168,11 +168,26 @@ def trace_shard(
     ids = np.arange(*probes, dtype=np.uint64)
     capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
     spans = allocation.spans(samples, slice(*probes))
+    seen: dict[str, NDArray[np.float32]] = {}
+    looked = 0
+    if samples[0] == 0:
+        seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag)
+        kept = outside(seen["backface"])
+        seen = {name: values if name == "backface" else values[kept] for name, values in seen.items()}
+        spans[~kept, :, 1] = spans[~kept, :, 0]
+    else:
+        kept = allocation.eighths[slice(*probes)].max(1) > 0
     irradiance, radiance, rays = capture_radiance(
-        prepared.tracer, positions, ids, spans, capture, threads=threads, cancelled=flag, advance=advance
+        prepared.tracer,
+        np.ascontiguousarray(positions[kept]),
+        ids[kept],
+        np.ascontiguousarray(spans[kept]),
+        capture,
+        threads=threads,
+        cancelled=flag,
+        advance=advance,
     )
     empty = np.zeros
-    seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else ({}, 0)
     return Tally(
         *probes,
         *samples,

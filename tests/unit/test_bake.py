@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bake_core import tally
 from bake_core.allocation import Allocation
 from bake_core.bake import BakeResult, bake, empty_state, finish, gather, prepare, shard_ranges, trace_shard
 from bake_core.bundle import read_bundle, read_report
@@ -23,7 +24,8 @@ from bake_core.errors import BakeError, Cancelled, SceneError
 from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
 from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
-from bake_core.octahedral import texel_directions, with_border
+from bake_core.irradiance import sample
+from bake_core.octahedral import oct_to_dir, texel_directions, with_border
 from bake_core.progress import Progress
 from bake_core.report import Run
 from bake_core.spec import Stop, parse_spec
@@ -416,8 +418,66 @@ def test_probes_inside_geometry_are_inactive(tmp_path: Path) -> None:
     probes = bake_into(tmp_path, w.to_glb(), spec).manifest["volumes"][0]["probes"]
     assert probes["states"] == [0, 1] and probes["active"] == 1
     assert probes["backface"] == [1, 0]
-    volume = read_bundle(tmp_path / "out").volumes[0]
-    assert volume.states.tolist() == [0, 1] and not maps(read_bundle(tmp_path / "out"))[0].any()
+    bundle = read_bundle(tmp_path / "out")
+    assert bundle.volumes[0].states.tolist() == [0, 1] and bundle.volumes[0].tiles.tolist() == [-1, 0]
+    assert len(maps(bundle)) == 1 and maps(bundle).all()
+
+
+def test_leaving_out_probes_inside_solids_changes_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Baked both ways: texels of kept probes and what a query weighs them by are the same bits; rays and bytes are fewer."""
+    glb, spec = box_among_probes()
+    spec["outputs"] = ["irradiance", "visibility", "radiance", "distance", "normal"]
+    spec["stop"] = {"target_error": 1e-9, "max_samples": 64}
+    fewer = bake_into(tmp_path, glb, spec, "fewer", shards=3)
+    with monkeypatch.context() as patch:
+        patch.setattr(tally, "BACKFACE_LIMIT", 2.0)
+        everything = bake_into(tmp_path, glb, spec, "all")
+    a, b = read_bundle(tmp_path / "fewer"), read_bundle(tmp_path / "all")
+    kept = a.volumes[0].states == 1
+    assert (~kept).sum() == 8 and b.volumes[0].states.all()
+    for output in spec["outputs"]:
+        np.testing.assert_array_equal(maps(a, output), maps(b, output)[kept])
+    assert fewer.run.curve[-1].rays < everything.run.curve[-1].rays
+    ((entry,), none) = fewer.manifest["left_out"], everything.manifest["left_out"]
+    assert none == [] and entry["what"] == "8 of 64 probes"
+    half, full = (
+        sum(x.texels[0, 0, 0].size * x.tile**2 for x in a.volumes[0].atlases.values() if x.encoding == e) for e in ("half", "float")
+    )
+    assert entry["bytes"] == 8 * (2 * half + 4 * full)
+    size = [sum(x.texels.size for x in bundle.volumes[0].atlases.values()) for bundle in (a, b)]
+    assert size[0] == size[1] * 56 / 64
+
+    random = np.random.default_rng(5)
+    points, normals = random.uniform(-2, 2, (500, 3)), oct_to_dir(random.uniform(-1, 1, (500, 2)))
+    ours, theirs = (sample(bundle.volumes, points, normals) for bundle in (a, b))
+    weights = theirs.weights * kept[theirs.probes]
+    some = weights.sum(-1) > 0
+    np.testing.assert_allclose(ours.weights[some], weights[some] / weights[some].sum(-1, keepdims=True), rtol=1e-12)
+    assert not ours.weights[~kept[ours.probes]].any() and some.sum() > 400
+
+
+def test_a_volume_within_a_solid_has_no_tiles_and_gives_no_light(tmp_path: Path) -> None:
+    glb, spec = box_among_probes()
+    spec["volumes"] = [{"origin": [-0.2] * 3, "spacing": [0.4] * 3, "counts": [2, 2, 2]}]
+    spec["stop"] = {"target_error": 0.01, "max_samples": 32}
+    result = bake_into(tmp_path, glb, spec)
+    assert result.manifest["volumes"][0]["probes"]["active"] == 0
+    bundle = read_bundle(tmp_path / "out")
+    found = sample(bundle.volumes, [[0, 0, 0]], [[0, 1, 0]])
+    assert not found.irradiance.any() and not found.weights.any() and (bundle.volumes[0].tiles == -1).all()
+
+
+def box_among_probes() -> tuple[bytes, dict[str, Any]]:
+    """4³ probes, of which the inner eight are inside a box."""
+    from trimesh.creation import box
+
+    from bake_core.gltf.writer import Part
+
+    mesh = box((2, 2, 2))
+    w = GlbWriter()
+    part = Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material=w.material("grey", (0.5,) * 3))
+    w.node("box", mesh=w.mesh("box", [part]))
+    return w.to_glb(), {"volumes": [{"origin": [-1.95] * 3, "spacing": [1.3] * 3, "counts": [4, 4, 4]}], "environment": sky()}
 
 
 def test_several_volumes_are_baked_each_by_itself(tmp_path: Path) -> None:

@@ -194,7 +194,7 @@ def test_what_is_no_bundle_is_said_to_be_none(tmp_path: Path, folder: Path) -> N
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("manifest.json", '{"format": "other"}')
     assert refused(tmp_path / "other.zip").slug == "bundle.not_a_bundle"
-    edit(folder, lambda m: m.update(version=2))
+    edit(folder, lambda m: m.update(version=1))
     assert refused(folder).slug == "bundle.version"
     edit(folder, lambda m: m.update(format="other"))
     assert refused(folder).slug == "bundle.not_a_bundle"
