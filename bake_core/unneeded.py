@@ -15,30 +15,30 @@ def unneeded(tables: Tables) -> tuple[LeftOut, ...]:
     t = tables
     found = []
     if t.textures is None:
-        found.append(("code: textures", "no material has a texture, is cut out, blended or unlit: none of its code is compiled in"))
+        found.append(("code for textures", "no material has a texture, is cut out, blended or unlit: none of its code is compiled in"))
     elif not len(t.textures.alpha_mode):
-        found.append(("code: alpha test", "every material in use is opaque: shadow rays ask whether anything is hit, not what"))
+        found.append(("code for alpha test", "every material in use is opaque: shadow rays ask whether anything is hit, not what"))
     if t.gloss is None:
         found.append(
-            ("code: gloss", "every material in use has metallic 0 and roughness 1, which is exactly Lambert: no GGX is compiled in")
+            ("code for gloss", "every material in use has metallic 0 and roughness 1, which is exactly Lambert: no GGX is compiled in")
         )
     if t.sky is None:
         found.append(
             (
-                "code: sky sampling",
+                "code for sky sampling",
                 "the environment is one colour, for which cosine sampling is ideal: no search of an image is compiled in",
             )
         )
     if t.sky is None and not t.environment.any():
-        found.append(("code: environment", "it is black: a path's last ray is not traced where nothing is emissive"))
+        found.append(("code for environment", "it is black: a path's last ray is not traced where nothing is emissive"))
     if not len(t.emitters.cdf):
-        found.append(("code: emitter sampling", "no triangle is emissive: no ray is sent to one"))
+        found.append(("code for emitter sampling", "no triangle is emissive: no ray is sent to one"))
     if not len(t.lights.cdf):
-        found.append(("code: light sampling", "neither scene nor spec has a punctual or directional light: no ray is sent to one"))
+        found.append(("code for light sampling", "neither scene nor spec has a punctual or directional light: no ray is sent to one"))
     if len(t.item_first_triangle) == 1:
-        found.append(("code: instances", "every mesh stands in one place: hits are taken as they are"))
+        found.append(("code for instances", "every mesh stands in one place: hits are taken as they are"))
     if not len(t.normals):
-        found.append(("code: vertex normals", "no mesh has any: triangles are flat"))
+        found.append(("code for vertex normals", "no mesh has any: triangles are flat"))
     if not len(t.colors):
-        found.append(("code: vertex colours", "no mesh has any"))
+        found.append(("code for vertex colours", "no mesh has any"))
     return tuple(LeftOut(what, why) for what, why in found)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from service.cli.bake import positive
 from service.cli.progress import duration, in_bytes, percent
@@ -61,7 +62,7 @@ def _lines(made: Plan, spec: Spec, threads: int) -> list[str]:
         origin, spacing = (", ".join(f"{x:.4g}" for x in values) for values in (v.origin, v.spacing))
         lines.append(f"volume     {v.name}: {'×'.join(map(str, v.counts))} probes from ({origin}) every ({spacing}) m")
     lines.append(f"kept       {', '.join(made.outputs)}: {in_bytes(made.atlas_bytes)} before compression")
-    lines += [f"left out   {x.what}: {x.why}{'' if x.bytes is None else f'; saves {in_bytes(x.bytes)}'}" for x in made.left_out]
+    lines += left_out_lines([x.entry() for x in made.left_out])
     lines.append(f"speed      {made.paths_per_second / 1e6:.2f} M paths/s on {threads} threads, from a few probes")
     target, most = spec.stop.target_error, spec.stop.max_samples
     if target is None or made.pilot_error is None:
@@ -76,6 +77,17 @@ def _lines(made: Plan, spec: Spec, threads: int) -> list[str]:
             f"time       {duration(made.most_seconds)} of tracing, for {most} samples; an error of {percent(target)} may need more"
         )
     lines.append(f"memory     {in_bytes(made.memory_bytes)}")
+    return lines
+
+
+def left_out_lines(entries: list[dict[str, Any]]) -> list[str]:
+    """The manifest's `left_out` for people: one line for all that have one reason."""
+    lines = []
+    for why, alike in groupby(entries, key=lambda x: x["why"]):
+        group = list(alike)
+        sizes = [x["bytes"] for x in group if "bytes" in x]
+        saves = f"; saves {in_bytes(sum(sizes))}" if sizes else ""
+        lines.append(f"left out   {', '.join(x['what'] for x in group)}: {why}{saves}")
     return lines
 
 

@@ -92,7 +92,7 @@ FOUR = [{"origin": [-0.2, 0.2, -0.2], "spacing": [0.4, 0.4, 0.4], "counts": [2, 
 
 def test_what_kernels_do_without_is_said_of_each_scene() -> None:
     def of(scene: Scene, **more: Any) -> set[str]:
-        return {x.what.removeprefix("code: ") for x in prepare(scene, spec(**more)).left_out if x.what.startswith("code: ")}
+        return {x.what.removeprefix("code for ") for x in prepare(scene, spec(**more)).left_out if x.what.startswith("code for ")}
 
     always = {"textures", "sky sampling", "instances"}
     bare = square_scene()
