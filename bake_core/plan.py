@@ -105,7 +105,7 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
 
 
 def samples_needed(spec: Spec, error: float | None) -> int:
-    """Samples to the target, judged by the error after the pilot: as independent ones have it, σ²/n. Scrambled points need fewer."""
+    """Samples to the target, judged by the error after the pilot: as independent ones have it, σ²/n. An estimate, no bound."""
     stop = spec.stop
     if stop.target_error is None or error is None:
         return stop.max_samples
