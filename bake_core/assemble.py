@@ -20,7 +20,7 @@ from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.images import write_exr
 from bake_core.placement import Volume
 from bake_core.scene import Scene
-from bake_core.selection import Selection
+from bake_core.selection import LeftOut, Selection
 from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.shader_files import shader_dir
 from bake_core.spec import OutputName, Spec
@@ -47,9 +47,21 @@ _WORST_PROBES = 8
 
 
 def assemble(
-    scene: Scene, spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State, stopped: Verdict, folder: Path
+    scene: Scene,
+    spec: Spec,
+    volumes: tuple[Volume, ...],
+    selection: Selection,
+    left_out: tuple[LeftOut, ...],
+    state: State,
+    stopped: Verdict,
+    folder: Path,
 ) -> dict[str, Any]:
     """Write atlases and shaders into a folder.
+
+    Parameters
+    ----------
+    left_out : tuple of LeftOut
+        Outputs and all else.
 
     Returns
     -------
@@ -89,7 +101,7 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [{"what": what, "why": why} for what, why in selection.left_out] + _left_out_probes(active, saved),
+        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},

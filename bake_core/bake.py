@@ -39,10 +39,11 @@ from bake_core.progress import ProgressCallback
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
-from bake_core.selection import Selection, select
+from bake_core.selection import LeftOut, Selection, select
 from bake_core.spec import Spec
 from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
+from bake_core.unneeded import unneeded
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64
@@ -72,6 +73,11 @@ class Prepared:
     def probe_count(self) -> int:
         return len(self.positions)
 
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Outputs first, then what kernels do without."""
+        return self.selection.left_out + unneeded(self.tracer.tables)
+
 
 def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     """Place the probes, choose the outputs, build the acceleration structure.
@@ -88,11 +94,12 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     volumes = place(scene, spec)
     environment, named = read_environment(spec.environment, find)
     spec = spec.model_copy(update={"environment": named})
+    probes = sum(v.probe_count for v in volumes)
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
-        selection=select(scene, spec),
+        selection=select(scene, spec, probes),
         tracer=Tracer.build(scene, spec, environment),
         positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
@@ -345,7 +352,9 @@ def finish(
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
             work = Path(folder) / "bundle"
             work.mkdir()
-            manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
+            manifest = assemble(
+                prepared.scene, prepared.spec, prepared.volumes, prepared.selection, prepared.left_out, state, run.stopped, work
+            )
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)
             allowed = DEFAULT_SHARE * run.seconds if audit_seconds is None else audit_seconds

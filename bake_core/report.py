@@ -107,7 +107,7 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         (p["volume"], p["probe"], ", ".join(f"{x:.4g}" for x in p["position"]), percent(p["error"]))
         for p in manifest["error"]["probes"]["worst"]
     ]
-    left_out = [(x["what"], x["why"]) for x in manifest["left_out"]]
+    left_out = [(x["what"], x["why"], f"{x['bytes']:,} bytes" if "bytes" in x else "time") for x in manifest["left_out"]]
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>octobake report</title>"
         "<style>body{font:16px system-ui;max-width:60rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse;margin:1rem 0}"
@@ -127,7 +127,7 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         + "<h2>Atlases</h2>"
         + _table(("volume", "output", "stored as", "cost of storing", "file"), atlases)
         + "<h2>Left out</h2>"
-        + (_table(("what", "why"), left_out) if left_out else "<p>Nothing.</p>")
+        + (_table(("what", "why", "saves"), left_out) if left_out else "<p>Nothing.</p>")
         + "</html>\n"
     )
 
