@@ -68,7 +68,7 @@ def lights_and_emitters(baker: Baker) -> Result:
         expected,
         found,
         tolerance,
-        f"mean irradiance over the sphere, (π Le + a Σ I/R²)/(1 − a); 4σ of {paths} paths, the ball's facets, texels",
+        f"mean irradiance over the sphere, (π Le + a Σ I/R²)/(1 − a); 4σ of {paths} paths; facets; texels",
     )
 
 
