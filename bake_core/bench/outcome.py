@@ -143,6 +143,7 @@ def error_against_seconds(series: Sequence[Series]) -> Drawing:
         return Drawing(_WIDTH, height, lines, texts)
     everything = [p for _, points in shown for p in points]
     at = log_frame(lines, texts, _BOX, ticks([x for x, _ in everything], 10), ticks([e for _, e in everything], 10), "seconds")
+    texts.append(Text((_BOX[0], 20), "Error against seconds", 15, INK, "start"))
     for i, (s, points) in enumerate(shown):
         colour = _COLOURS[i % len(_COLOURS)]
         rate = s.rate

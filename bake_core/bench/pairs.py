@@ -113,7 +113,7 @@ def when(curve: Sequence[tuple[float, float]], error: float) -> float | None:
             if e1 <= 0:
                 return x1
             share = math.log(e0 / error) / math.log(e0 / e1)
-            return x0 * (x1 / x0) ** share
+            return x0 * math.exp(share * math.log(x1 / x0))
     return None
 
 
