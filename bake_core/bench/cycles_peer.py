@@ -37,7 +37,8 @@ def material(name: str, work: Any) -> Any:
     shader.inputs["Color"].default_value = (*work[name + ".albedo"].tolist(), 1)
     if len(work[name + ".color"]):
         attribute = nodes.new("ShaderNodeAttribute")
-        attribute.attribute_name = "vertex_color"
+        # Not "vertex_color", which Cycles takes for a standard attribute of its own, and finds black.
+        attribute.attribute_name = "octobake_albedo"
         links.new(attribute.outputs["Vector"], shader.inputs["Color"])
     surface = shader.outputs[0]
     if emission.any():
@@ -71,7 +72,7 @@ def mesh(name: str, work: Any) -> Any:
     out.update(calc_edges=True)
     out.shade_flat()
     if len(color):
-        out.attributes.new("vertex_color", "FLOAT_VECTOR", "POINT").data.foreach_set("vector", color.ravel())
+        out.attributes.new("octobake_albedo", "FLOAT_VECTOR", "POINT").data.foreach_set("vector", color.ravel())
     out.materials.append(material(name, work))
     return out
 
