@@ -84,6 +84,11 @@ def bake_to(subject: Subject, stop: Stop, threads: int, folder: Path, outputs: A
     )
 
 
+def warm_up(subject: Subject, threads: int, folder: Path, outputs: Any = None, **options: Any) -> None:
+    """Bake one sample, so that no measured bake loads or compiles kernels."""
+    bake_to(subject, Stop(target_error=None, max_samples=1), threads, folder, outputs, **options)
+
+
 @dataclass(frozen=True)
 class Targets:
     """What :func:`measure` found."""
@@ -180,6 +185,7 @@ def measure(
     baked = []
     with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder:
         for subject in subjects:
+            warm_up(subject, threads, Path(folder))
             for target in sorted(targets, reverse=True):
                 stop = Stop(target_error=target, max_seconds=max_seconds, max_samples=max_samples)
                 b = bake_to(subject, stop, threads, Path(folder))
