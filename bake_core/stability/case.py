@@ -59,7 +59,6 @@ class Baker:
 
     folder: Path
     threads: int
-    cancelled: NDArray[np.uint8]
 
     def __call__(self, example: Example, **changes: Any) -> Bundle:
         """Bake an example with some of its spec's keys changed; the bundle as read back from disk.
@@ -73,7 +72,7 @@ class Baker:
         scene = self.folder / "scene.glb"
         scene.write_bytes(glb)
         out = self.folder / "bundle"
-        bake(scene, parse_spec({**spec, **changes}), out, threads=self.threads, find=beside(self.folder), cancelled=self.cancelled)
+        bake(scene, parse_spec({**spec, **changes}), out, threads=self.threads, find=beside(self.folder))
         bundle = read_bundle(out)
         for volume in bundle.volumes:
             for atlas in volume.atlases.values():
