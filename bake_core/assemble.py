@@ -78,7 +78,7 @@ def assemble(
     first = 0
     for volume in volumes:
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection, state, active, probes, folder)
+        entry, content = _volume(volume, selection, state, active, probes, folder, whole=spec.outputs != "auto")
         entries.append(entry)
         data.append(content)
         inside = volume.probe_count - entry["probes"]["active"]
@@ -101,7 +101,7 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved),
+        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved) + _left_out_channels(entries, data),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
@@ -115,6 +115,22 @@ def _left_out_probes(active: NDArray[np.bool_], saved: int) -> list[dict[str, An
         return []
     why = "inside solids: more than a quarter of what they see are backs of single-sided surfaces"
     return [{"what": f"{inside} of {len(active)} probes", "why": why, "bytes": saved}]
+
+
+def _left_out_channels(entries: list[dict[str, Any]], data: list[VolumeData]) -> list[dict[str, Any]]:
+    """What the manifest says of maps that take less room than their texels."""
+    out = []
+    for entry, volume in zip(entries, data, strict=True):
+        for described in entry["atlases"]:
+            atlas, names = volume.atlases[described["output"]], described["channels"]
+            size = atlas.texels[..., 0].size * _BYTES[atlas.encoding]
+            what = f"{volume.name}: {atlas.output}"
+            if "constant" in described:
+                out.append({"what": f"{what} map", "why": "every texel is the same", "bytes": size * len(names)})
+            elif len(set(names)) < len(names):
+                why = "nothing in it has a hue: one channel holds all three"
+                out.append({"what": f"{what} in colour", "why": why, "bytes": size * (len(names) - 1)})
+    return out
 
 
 def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State) -> dict[str, Any]:
@@ -146,9 +162,9 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 
 def _volume(
-    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path
+    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path, *, whole: bool
 ) -> tuple[dict[str, Any], VolumeData]:
-    """One volume's files, its entry in the manifest, and what its shaders need to know."""
+    """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
     kept = np.flatnonzero(active[probes])
     maps = {output: _interior(output, selection, state, probes)[kept] for output in selection.outputs}
     tiles = [m.shape[1] + 2 for m in maps.values()]
@@ -165,17 +181,22 @@ def _volume(
         atlas = Atlas(
             output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding
         )
-        file = f"{volume.name}.{output}.exr"
-        _write_layers(folder / file, atlas.texels, output, half=encoding == "half")
         entry: dict[str, Any] = {
             "output": output,
-            "file": file,
+            "file": f"{volume.name}.{output}.exr",
             "encoding": encoding,
             "encoding_error": cost,
             "channels": list(CHANNELS[output]),
             "tile": atlas.tile,
             "interior": atlas.interior,
         }
+        if not whole and len(kept) and (interior == interior[0, 0, 0]).all():
+            stored = interior[0, 0, 0].astype(np.float16 if encoding == "half" else np.float32)
+            entry |= {"file": None, "constant": [float(str(x)) for x in stored]}
+        elif not whole and entry["channels"] == ["R", "G", "B"] and (interior == interior[..., :1]).all():
+            entry["channels"] = ["Y"] * 3
+        if entry["file"] is not None:
+            _write_layers(folder / entry["file"], atlas.texels, tuple(dict.fromkeys(entry["channels"])), half=encoding == "half")
         if output == "distance":
             entry["miss"] = selection.miss_distance
         atlases[output] = atlas
@@ -194,7 +215,7 @@ def _volume(
     )
     table = probe_texels(content)
     probe_file = f"{volume.name}.probes.exr"
-    _write_layers(folder / probe_file, table, "probes", half=False)
+    _write_layers(folder / probe_file, table, CHANNELS["probes"], half=False)
     entry = {
         "name": volume.name,
         "origin": volume.origin.tolist(),
@@ -235,7 +256,7 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
         return np.asarray(state.mean_radiance(probes), np.float32).reshape(-1, selection.capture, selection.capture, 3)
 
 
-def _write_layers(path: Path, texels: F32, output: str, *, half: bool) -> None:
-    """Layers stacked downwards in one image, so that one read gives a 2D array's texels in order."""
-    layers, height, width, channels = texels.shape
-    write_exr(path, texels.reshape(layers * height, width, channels), CHANNELS[output], half=half)
+def _write_layers(path: Path, texels: F32, channels: tuple[str, ...], *, half: bool) -> None:
+    """Layers stacked downwards in one image, so that one read gives a 2D array's texels in order; of alike channels the first ones."""
+    layers, height, width, _ = texels.shape
+    write_exr(path, np.ascontiguousarray(texels.reshape(layers * height, width, -1)[..., : len(channels)]), channels, half=half)

@@ -320,13 +320,18 @@ def _read_volume(folder: Path, v: dict[str, Any], files: dict[str, Any]) -> Volu
     if len(v["counts"]) != 3 or backface.shape != (n,) or len(v["probes"]["states"]) != n:
         raise ValueError(f"volume {v['name']!r}: its counts are not those of its probes")
     atlases = {}
-    for file in (v["probes"]["file"], *(a["file"] for a in v["atlases"])):
+    for file in (v["probes"]["file"], *(a["file"] for a in v["atlases"] if a["file"] is not None)):
         if file not in files:
             raise ValueError(f"the digest of {file!r}")
     for a in v["atlases"]:
-        pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
-        height = packing["rows"] * a["tile"]
-        texels = pixels.reshape(packing["layers"], height, packing["columns"] * a["tile"], len(CHANNELS[a["output"]]))
+        size = (packing["layers"], packing["rows"] * a["tile"], packing["columns"] * a["tile"], len(CHANNELS[a["output"]]))
+        if a["file"] is None:
+            texels = np.broadcast_to(np.asarray(a["constant"], np.float32), size)
+        else:
+            pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
+            # One channel may stand for several.
+            names = list(dict.fromkeys(a["channels"]))
+            texels = np.ascontiguousarray(pixels[..., [names.index(name) for name in a["channels"]]]).reshape(size)
         atlases[a["output"]] = Atlas(
             a["output"], texels, a["tile"], a["interior"], packing["columns"], packing["rows"], packing["layers"], a["encoding"]
         )

@@ -98,7 +98,11 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         "bundle": document["content_digest"],
     }
     atlases = [
-        (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"]) for v in manifest["volumes"] for a in v["atlases"]
+        (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"] or "none: constant")
+        for v in manifest["volumes"]
+        for a in v["atlases"]
+        for v in manifest["volumes"]
+        for a in v["atlases"]
     ]
     curve = [(p["samples"], f"{p['rays']:,}", f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
     fitted = [(f"against {name}", in_words(rate)) for name, rate in zip(("samples", "seconds of tracing"), run.rates(), strict=True)]

@@ -49,8 +49,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         counts, inside = "×".join(map(str, v["counts"])), probes["count"] - probes["active"]
         lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry")
         for a in v["atlases"]:
-            cost = percent(a["encoding_error"])
-            lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {a['file']}")
+            cost, file = percent(a["encoding_error"]), a["file"] or "no file, all texels are the same"
+            lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {file}")
     lines += left_out_lines(manifest["left_out"])
     lines += [f"ignored    {line}" for line in manifest["scene"]["ignored"]]
     if report is not None:
