@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 from bake_core.bake import Prepared, check_finite, compile_kernels, finish, gather, prepare
+from bake_core.bundle import read_bundle
 from bake_core.clock import Clock
 from bake_core.environment import Find, no_images
 from bake_core.report import Run
@@ -26,6 +28,8 @@ class Way:
         Of the bundle's files, as compressed.
     error : float or None
         The error figure.
+    digests : dict of str to str
+        SHA-256 of the texels as a reader has them, by ``volume.output``: however many channels a file spends on them.
     """
 
     seconds: float
@@ -37,7 +41,7 @@ class Way:
 
 @dataclass(frozen=True)
 class BothWays:
-    """`same` names the atlases that both bundles have, byte for byte alike; `other` those that differ."""
+    """`same` names the maps that both bundles hold with the same texels, bit for bit; `other` those that differ."""
 
     without: Way
     everything: Way
@@ -77,11 +81,11 @@ def _bake(prepared: Prepared, threads: int) -> Way:
     seconds = run.curve[-1].seconds
     with tempfile.TemporaryDirectory(prefix="octobake-both-ways-") as folder:
         manifest = finish(prepared, state, run, Path(folder) / "bundle", audit_seconds=0)
-    atlases = {name: entry for name, entry in manifest["files"].items() if name.endswith(".exr")}
+        volumes = read_bundle(Path(folder) / "bundle").volumes
     return Way(
         seconds=seconds,
         bytes=sum(entry["bytes"] for entry in manifest["files"].values()),
         samples=state.samples,
         error=state.error(),
-        digests={name: entry["sha256"] for name, entry in atlases.items()},
+        digests={f"{v.name}.{x.output}": sha256(x.texels.tobytes()).hexdigest() for v in volumes for x in v.atlases.values()},
     )

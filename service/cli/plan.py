@@ -97,7 +97,7 @@ def _measured(both: BothWays) -> list[str]:
     for name, way in (("left out", both.without), ("demanded", both.everything)):
         error = "unknown" if way.error is None else percent(way.error)
         lines.append(f"{name:<12}{way.seconds:>9.2f}{way.samples:>9}{in_bytes(way.bytes):>10}{error:>9}")
-    lines.append(f"same bytes  {', '.join(both.same) or 'none'}")
+    lines.append(f"same texels {', '.join(both.same) or 'none'}")
     if both.other:
-        lines.append(f"other bytes {', '.join(both.other)}")
+        lines.append(f"others      {', '.join(both.other)}")
     return lines

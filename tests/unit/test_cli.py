@@ -299,7 +299,7 @@ def test_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert told["probes"] == 8 and told["outputs"] == ["irradiance", "visibility"] and told["seconds"] > 0
     assert told["measured"] is None and told["left_out"][0].keys() == {"what", "why", "bytes"}
     assert main(["plan", scene, "--spec", spec_file, "--measure", "--threads", "1"]) == 0
-    assert "left out" in (text := capsys.readouterr().out) and "same bytes  box.irradiance.exr" in text and "other bytes" not in text
+    assert "left out" in (text := capsys.readouterr().out) and "same texels box.irradiance" in text and "others" not in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.glb", "spec.json"]
 
 

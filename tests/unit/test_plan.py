@@ -121,7 +121,7 @@ def test_nothing_left_out_changes_what_is_kept(kind: str) -> None:
         wanted = parse_spec({**document, "volumes": [{"fit": "scene", "counts": [2, 2, 2]}], "stop": LIT["stop"]})
     both = measure(scene, wanted, threads=1)
     assert both.other == []
-    assert {name.split(".")[1] for name in both.same} == {"irradiance", "visibility", "probes"}
+    assert {name.split(".")[1] for name in both.same} == {"irradiance", "visibility"}
     assert len(both.everything.digests) == len(both.same) + 3
     assert both.without.error == both.everything.error
     assert both.without.bytes < both.everything.bytes
