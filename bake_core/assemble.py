@@ -74,15 +74,15 @@ def assemble(
         ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
     """
     active = state.active()
-    entries, data, saved = [], [], 0
+    entries, data, saved = [], [], np.zeros(2, np.int64)
     first = 0
-    for volume in volumes:
+    for index, volume in enumerate(volumes):
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection, state, active, probes, folder, whole=spec.outputs != "auto")
+        entry, content = _volume(volume, selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto")
         entries.append(entry)
         data.append(content)
-        inside = volume.probe_count - entry["probes"]["active"]
-        saved += inside * sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
+        size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
+        saved += np.array([(content.states == state).sum() * size for state in (0, 2)])
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
@@ -101,20 +101,22 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved) + _left_out_channels(entries, data),
+        "left_out": [x.entry() for x in left_out] + _left_out_probes(state, saved) + _left_out_channels(entries, data),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
     }
 
 
-def _left_out_probes(active: NDArray[np.bool_], saved: int) -> list[dict[str, Any]]:
-    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression."""
-    inside = len(active) - int(active.sum())
-    if not inside:
-        return []
-    why = "inside solids: more than a quarter of what they see are backs of single-sided surfaces"
-    return [{"what": f"{inside} of {len(active)} probes", "why": why, "bytes": saved}]
+def _left_out_probes(state: State, saved: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression, by the two reasons."""
+    count = [int((state.needed & ~state.active()).sum()), int((~state.needed).sum())]
+    why = [
+        "inside solids: more than a quarter of what they see are backs of single-sided surfaces",
+        "needed by no surface: none lies in the cells around them, and the spec's receivers are surfaces",
+    ]
+    whole = len(state.needed)
+    return [{"what": f"{n} of {whole} probes", "why": w, "bytes": int(b)} for n, w, b in zip(count, why, saved, strict=True) if n]
 
 
 def _left_out_channels(entries: list[dict[str, Any]], data: list[VolumeData]) -> list[dict[str, Any]]:
@@ -162,11 +164,19 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 
 def _volume(
-    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path, *, whole: bool
+    volume: Volume,
+    outputs: tuple[OutputName, ...],
+    selection: Selection,
+    state: State,
+    active: NDArray[np.bool_],
+    probes: slice,
+    folder: Path,
+    *,
+    whole: bool,
 ) -> tuple[dict[str, Any], VolumeData]:
     """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
     kept = np.flatnonzero(active[probes])
-    maps = {output: _interior(output, selection, state, probes)[kept] for output in selection.outputs}
+    maps = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
     tiles = [m.shape[1] + 2 for m in maps.values()]
     shape = layout(volume.counts, max(tiles), len(kept))
     atlases: dict[str, Atlas] = {}
@@ -201,12 +211,13 @@ def _volume(
             entry["miss"] = selection.miss_distance
         atlases[output] = atlas
         described.append(entry)
+    states = np.where(active[probes], 1, np.where(state.needed[probes], 0, 2)).astype(np.uint8)
     content = VolumeData(
         name=volume.name,
         origin=volume.origin,
         spacing=volume.spacing,
         counts=np.asarray(volume.counts, np.int64),
-        states=active[probes].astype(np.uint8),
+        states=states,
         offsets=np.zeros((volume.probe_count, 3), np.float32),
         backface=state.backface[probes],
         parameters=PARAMETERS,
@@ -228,7 +239,7 @@ def _volume(
             "file": probe_file,
             "count": volume.probe_count,
             "active": len(kept),
-            "states": active[probes].astype(int).tolist(),
+            "states": states.tolist(),
             "offsets": None,
             # Shortest decimals of the float32 values.
             "backface": [float(str(b)) for b in state.backface[probes]],

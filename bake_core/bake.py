@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
-from bake_core.assemble import assemble
+from bake_core.assemble import PARAMETERS, assemble
 from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
 from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
@@ -36,10 +36,13 @@ from bake_core.filtering import visibility_moments
 from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
+from bake_core.reach import probes_about_surfaces
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
+from bake_core.sealed import is_sealed
 from bake_core.selection import LeftOut, Selection, select
+from bake_core.shader_constants import biases
 from bake_core.spec import Spec
 from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
@@ -59,6 +62,12 @@ class Prepared:
         Of all probes of all volumes in turn, local frame.
     limits : (n,) float64
         Each probe's distance limit, metres.
+    needed : (n,) bool
+        Which of them are baked at all, unless they turn out to stand inside a solid.
+    tracer : Tracer
+        What probes are traced with.
+    whole : Tracer
+        The scene as it is: what audits look at. It has an environment that `tracer` may do without.
     """
 
     scene: Scene
@@ -66,8 +75,10 @@ class Prepared:
     volumes: tuple[Volume, ...]
     selection: Selection
     tracer: Tracer
+    whole: Tracer
     positions: NDArray[np.float64]
     limits: NDArray[np.float64]
+    needed: NDArray[np.bool_]
 
     @property
     def probe_count(self) -> int:
@@ -76,7 +87,7 @@ class Prepared:
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
         """Outputs first, then what kernels do without."""
-        return self.selection.left_out + unneeded(self.tracer.tables)
+        return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
 
 
 def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
@@ -94,16 +105,30 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     volumes = place(scene, spec)
     environment, named = read_environment(spec.environment, find)
     spec = spec.model_copy(update={"environment": named})
-    probes = sum(v.probe_count for v in volumes)
+    positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
+    whole = Tracer.build(scene, spec, environment)
+    shines = environment.sky is not None or bool(environment.constant.any())
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
-        selection=select(scene, spec, probes),
-        tracer=Tracer.build(scene, spec, environment),
-        positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
+        selection=select(scene, spec, volumes),
+        tracer=whole.without_environment() if shines and is_sealed(scene, positions) else whole,
+        whole=whole,
+        positions=positions,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
+        needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
     )
+
+
+def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:
+    """Which probes any query on a surface asks, (n,) bool, of all volumes in turn: :func:`bake_core.reach.probes_about_surfaces`.
+
+    Surfaces are taken as far off as a query moves its point before it asks for visibility, which bounds what a renderer does to points.
+    """
+    counts = [np.asarray(v.counts, np.int64) for v in volumes]
+    margins = [sum(biases(PARAMETERS, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
+    return np.concatenate([probes_about_surfaces(scene, v, margin) for v, margin in zip(volumes, margins, strict=True)])
 
 
 def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
@@ -128,6 +153,7 @@ def empty_state(prepared: Prepared) -> State:
             samples=0,
             taken=start.taken,
             eighths=start.eighths,
+            needed=prepared.needed.copy(),
             irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3), np.float32),
             radiance=np.zeros((n, HALVES, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0, 0), np.float32),
             visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
@@ -178,9 +204,11 @@ def trace_shard(
     seen: dict[str, NDArray[np.float32]] = {}
     looked = 0
     if samples[0] == 0:
-        seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag)
-        kept = outside(seen["backface"])
-        seen = {name: values if name == "backface" else values[kept] for name, values in seen.items()}
+        needed = prepared.needed[slice(*probes)]
+        seen, looked = _see(prepared, positions[needed], prepared.limits[slice(*probes)][needed], threads, flag)
+        free = outside(seen["backface"])
+        seen = {name: values if name == "backface" else values[free] for name, values in seen.items()}
+        seen["backface"], kept = _spread(seen["backface"], needed), _spread(free, needed)
         spans[~kept, :, 1] = spans[~kept, :, 0]
     else:
         kept = allocation.eighths[slice(*probes)].max(1) > 0
@@ -209,6 +237,13 @@ def trace_shard(
     )
 
 
+def _spread(values: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
+    """Values of those where a mask says so; zeros for the others."""
+    out = np.zeros(len(where), values.dtype)
+    out[where] = values
+    return out
+
+
 def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
     """Sums in single precision: 2⁻²⁴ of a value is far below what its samples know. What overflows is refused where maps are checked."""
     with np.errstate(over="ignore"):
@@ -219,7 +254,7 @@ def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
     if audited:
-        compile_audit(prepared.scene, prepared.tracer)
+        compile_audit(prepared.scene, prepared.whole)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -370,7 +405,7 @@ def finish(
 def _audit(prepared: Prepared, state: State, work: Path, seconds: float, threads: int, cancelled: NDArray[np.uint8] | None) -> Audit | None:
     """Of what has just been written; None where somebody has no more time for it."""
     volumes = bundle.read_bundle(work).volumes
-    baked = Baked(prepared.scene, prepared.spec, prepared.tracer, state, volumes, prepared.positions, prepared.limits)
+    baked = Baked(prepared.scene, prepared.spec, prepared.whole, state, volumes, prepared.positions, prepared.limits)
     try:
         return audit(baked, seconds, threads=threads, cancelled=cancelled)
     except Cancelled:

@@ -64,7 +64,7 @@ class VolumeData:
         Metres, world.
     counts : (3,) int64
     states : (n,) uint8
-        1 active; 0 inside geometry: no tile, weight 0 in every query.
+        1 active; 0 inside geometry, 2 needed by no surface: no tile, weight 0 in every query.
     offsets : (n, 3) float32
         Metres from the lattice point to where the probe stands.
     backface : (n,) float32

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.octahedral import dir_to_oct
+from bake_core.placement import cover
 from bake_core.shader_constants import probe_texels, surface_bias
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Samples:
     irradiance : (n, 3) float64
         E, no 1/π inside; everything but the direct light of punctual and directional lights.
     weights : (n, 8) float64
-        Of the probes around each point; they sum to 1, or are all 0 where every probe is inside geometry.
+        Of the probes around each point; they sum to 1, or are all 0 where none of them is active.
     probes : (n, 8) int64
         Flat indices of those probes within the volume. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
     volume : (n,) int64
@@ -108,16 +109,8 @@ def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.b
     for volume in volumes:
         last = volume.origin + volume.spacing * (np.asarray(volume.counts) - 1)
         beyond = np.maximum(volume.origin - positions, positions - last)
-        out |= (beyond <= cover(volume)).all(-1)
+        out |= (beyond <= cover(volume.spacing)).all(-1)
     return out
-
-
-def cover(volume: VolumeData) -> float:
-    """How far beyond its outermost probes a volume answers for points, metres.
-
-    Half of its longest spacing: along that side, its cells answer for points as far from their probes.
-    """
-    return float(volume.spacing.max()) / 2
 
 
 def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
@@ -159,7 +152,7 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
         trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
         light[:, corner] = bilinear(volume.atlases["irradiance"], tile, oct_toward)
     weights = trilinear * other
-    # Where nothing is left, the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
+    # Where nothing is left, the point stands on a probe, an edge or a face of the grid none of whose probes is active.
     weights = np.where(weights.sum(-1, keepdims=True) > 0, weights, other)
     total = weights.sum(-1, keepdims=True)
     weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)

@@ -5,7 +5,7 @@ Mirrors the struct ``ObVolume`` in ``shaders/grid.glsl`` field by field.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,10 +28,14 @@ def surface_bias(volume: VolumeData) -> tuple[float, float]:
     normal_bias, view_bias : float
         Metres.
     """
-    p = volume.parameters
-    several = volume.spacing[volume.counts > 1]
-    scale = p["bias_scale"] * float(several.min() if several.size else volume.spacing.min())
-    return p["normal_bias"] * scale, p["view_bias"] * scale
+    return biases(volume.parameters, volume.spacing, volume.counts)
+
+
+def biases(parameters: Mapping[str, float], spacing: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[float, float]:
+    """As :func:`surface_bias`, of a volume that is not baked yet."""
+    several = spacing[counts > 1]
+    scale = parameters["bias_scale"] * float(several.min() if several.size else spacing.min())
+    return parameters["normal_bias"] * scale, parameters["view_bias"] * scale
 
 
 def bundle_constants(volumes: Sequence[VolumeData], frame: ArrayLike = (0.0, 0.0, 0.0)) -> str:

@@ -46,8 +46,9 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
     ]
     for v in manifest["volumes"]:
         probes = v["probes"]
-        counts, inside = "×".join(map(str, v["counts"])), probes["count"] - probes["active"]
-        lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry")
+        counts, inside, unneeded = "×".join(map(str, v["counts"])), probes["states"].count(0), probes["states"].count(2)
+        none_asks = f", {unneeded} needed by no surface" if unneeded else ""
+        lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry{none_asks}")
         for a in v["atlases"]:
             cost, file = percent(a["encoding_error"]), a["file"] or "no file, all texels are the same"
             lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {file}")

@@ -185,7 +185,7 @@ def test_the_reader_on_the_page_reads_a_bundle(baked: Bundle) -> None:
             row, column = divmod(place, atlas.columns)
             at = np.s_[layer, row * atlas.tile : (row + 1) * atlas.tile, column * atlas.tile : (column + 1) * atlas.tile]
             np.testing.assert_array_equal(found[p], atlas.texels[at])
-    active = np.flatnonzero(volume.states)
+    active = np.flatnonzero(volume.states == 1)
     index = np.stack(np.unravel_index(active, volume.counts[::-1])[::-1], -1)
     positions = volume.origin + index * volume.spacing
     random = np.random.default_rng(0)

@@ -327,7 +327,7 @@ def test_what_cannot_be_stored_is_an_error_and_never_an_infinity(tmp_path: Path)
 def test_bright_light_is_stored_in_full(tmp_path: Path) -> None:
     glb, spec = closed_box(0.5, 50_000.0)
     manifest = bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 16}}).manifest
-    (irradiance, _) = manifest["volumes"][0]["atlases"]
+    (irradiance,) = manifest["volumes"][0]["atlases"]
     assert irradiance["encoding"] == "float"
     assert maps(read_bundle(tmp_path / "out")).mean() == pytest.approx(np.pi * 100_000, rel=0.01)
 
@@ -502,7 +502,7 @@ def test_nothing_but_sky(tmp_path: Path) -> None:
     w = GlbWriter()
     w.node("empty")
     grid = {"origin": [0, 0, 0], "spacing": [1, 1, 1], "counts": [1, 2, 1]}
-    bake_into(tmp_path, w.to_glb(), {"volumes": [grid], "environment": sky(2.0)})
+    bake_into(tmp_path, w.to_glb(), {"volumes": [grid], "environment": sky(2.0), "outputs": ["irradiance", "visibility"]})
     bundle = read_bundle(tmp_path / "out")
     np.testing.assert_allclose(maps(bundle), 2 * np.pi, rtol=1e-3)
     assert bundle.manifest["error"]["value"] < 1e-9 and bundle.manifest["stopped"] == "target"

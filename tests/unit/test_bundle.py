@@ -26,7 +26,7 @@ STOP = {"target_error": None, "max_samples": 4}
 
 
 def small_spec(**changes: Any) -> Spec:
-    return parse_spec({**closed_box(0.5, 1.0)[1], "stop": STOP, **changes})
+    return parse_spec({**closed_box(0.5, 1.0)[1], "outputs": ["irradiance", "visibility"], "stop": STOP, **changes})
 
 
 @pytest.fixture(scope="module")
