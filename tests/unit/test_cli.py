@@ -311,7 +311,7 @@ def test_info(baked: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "sha256:",
         "1×1×1 probes, 1 active",
         "irradiance",
-        "stored as float",
+        "stored as half",
         "left out",
         "seconds",
         "rays",
