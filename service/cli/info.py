@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
     from bake_core.rate import Rate, in_words
-    from bake_core.report import percent
+    from bake_core.report import audit_in_words, audit_of, percent
     from service.cli.plan import left_out_lines
     from service.cli.progress import count
 
@@ -58,5 +58,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         lines += ["", f"{'samples':>9}{'rays':>9}{'seconds':>10}{'error':>10}"]
         lines += [f"{p['samples']:>9}{count(p['rays']):>9}{p['seconds']:>10.2f}{percent(p['error']):>10}" for p in report["curve"]]
         rates = {name: rate and Rate(**rate) for name, rate in report["rate"].items()}
+        audit = audit_of(report)
+        if audit is not None:
+            lines += ["", f"audit      {audit_in_words(audit)}"]
         lines += ["", *(f"rate       {in_words(rate)}, against {name}" for name, rate in rates.items())]
     return lines

@@ -368,6 +368,7 @@ def test_all_outputs(tmp_path: Path) -> None:
     )
     bundle = read_bundle(tmp_path / "out")
     assert list(bundle.volumes[0].atlases) == everything
+    assert (tmp_path / "out" / "report.html").read_text().count("irradiance.exr") == 1
     assert not any("bytes" in x for x in result.manifest["left_out"])
     described = {a["output"]: a for a in result.manifest["volumes"][0]["atlases"]}
     assert [described[o]["interior"] for o in everything] == [4, 8, 16, 32, 16]

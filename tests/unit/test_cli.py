@@ -316,6 +316,7 @@ def test_info(baked: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "seconds",
         "rays",
         "against samples",
+        "audit      256 irradiance texels err by",
     ):
         assert word in text
     assert main(["info", str(baked), "--json"]) == 0
