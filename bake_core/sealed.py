@@ -7,10 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from bake_core.capture import capture_distance
 from bake_core.kernels import entry_kernel, kernel
-from bake_core.reach import items_meeting, triangles_meeting
+from bake_core.reach import items_meeting
 from bake_core.scene import ALPHA_OPAQUE, Scene
 from bake_core.surfaces import EPSILON
+from bake_core.tracer import Tracer
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -23,9 +25,11 @@ MOST_TRIANGLES = 1 << 14
 _SLIVER = 2.0**-20
 # Winding numbers are whole numbers everywhere but on the surface.
 _WINDS = 0.75
+# Rays along each side of the octahedral square by which a probe looks for a way out.
+_LOOKS = 16
 
 
-def is_sealed(scene: Scene, positions: F64) -> bool:
+def is_sealed(scene: Scene, tracer: Tracer, positions: F64) -> bool:
     """Whether every probe stands inside an opaque surface without a gap.
 
     A surface has no gap if each edge is passed as often one way as the other by the triangles that share it, corners of equal coordinates
@@ -51,7 +55,9 @@ def is_sealed(scene: Scene, positions: F64) -> bool:
     shells: dict[int, list[F64]] = {}
     while not inside.all():
         first = origins[inside.argmin()]
-        if _looks_out(scene, opaque, first):
+        # Most scenes are open, and the first ray that meets nothing has told.
+        distance, *_ = capture_distance(tracer, first[None], _LOOKS, cancelled=np.zeros(1, np.uint8))
+        if np.isinf(distance).any():
             return False
         left = np.flatnonzero(~inside)
         for mesh, transform in items_meeting(scene, np.stack([first, first])):
@@ -66,17 +72,6 @@ def is_sealed(scene: Scene, positions: F64) -> bool:
     return bool(len(origins))
 
 
-def _looks_out(scene: Scene, opaque: Bool, point: F64) -> bool:
-    """Whether a ray along an axis meets nothing: a quick answer for most scenes, from boxes of triangles about it."""
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            ray = np.stack([point, point])
-            ray[int(sign > 0), axis] = sign * math.inf
-            if not any(True for _ in triangles_meeting(scene, ray, opaque)):
-                return True
-    return False
-
-
 def _shells(scene: Scene, opaque: Bool, mesh: int) -> list[F64]:
     """The closed surfaces of a mesh, (t, 3, 3) float64 each, in its own space."""
     some = slice(int(scene.mesh_first_triangle[mesh]), int(scene.mesh_first_triangle[mesh + 1]))
@@ -84,14 +79,12 @@ def _shells(scene: Scene, opaque: Bool, mesh: int) -> list[F64]:
     if not len(indices):
         return []
     used, corner = np.unique(indices, return_inverse=True)
-    # Zeros of either sign are one.
-    _, welded = np.unique(scene.positions[used] + np.float32(0), axis=0, return_inverse=True)
-    triangles = welded.reshape(-1)[corner.reshape(-1)].reshape(-1, 3).astype(np.int64)
+    triangles = _welded(scene.positions[used])[corner.reshape(-1)].reshape(-1, 3)
     whole = (triangles != np.roll(triangles, 1, 1)).all(1)
     indices, triangles = indices[whole], triangles[whole]
     if not len(triangles):
         return []
-    label = np.arange(welded.max() + 1)
+    label = np.arange(triangles.max() + 1)
     _join(triangles, label)
     shell = label[triangles[:, 0]]
     corners = scene.positions[indices].astype(np.float64)
@@ -105,6 +98,18 @@ def _shells(scene: Scene, opaque: Bool, mesh: int) -> list[F64]:
     bad[shell[area <= _SLIVER * (sides**2).sum(-1).max(1)]] = True
     bad |= np.bincount(shell, minlength=len(label)) > MOST_TRIANGLES
     return [corners[shell == i] for i in np.unique(shell[~bad[shell]])]
+
+
+def _welded(positions: NDArray[np.float32]) -> I64:
+    """A number for each place, the same for those of equal coordinates, (n,); zeros of either sign are equal."""
+    bits = (positions + np.float32(0)).view(np.uint32).astype(np.uint64)
+    high, low = bits[:, 0] << np.uint64(32) | bits[:, 1], bits[:, 2]
+    order = np.lexsort((low, high))
+    new = np.ones(len(order), np.int64)
+    new[1:] = (high[order[1:]] != high[order[:-1]]) | (low[order[1:]] != low[order[:-1]])
+    out = np.empty(len(order), np.int64)
+    out[order] = np.cumsum(new) - 1
+    return out
 
 
 def _wound(corners: F64, points: F64) -> Bool:

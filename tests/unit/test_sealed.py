@@ -17,7 +17,7 @@ from bake_core.images import write_exr
 from bake_core.sealed import is_sealed
 from bake_core.spec import OUTPUTS, parse_spec
 from tests.baking import bake_example, maps
-from tests.scenes import add_square, icosphere, load, sky
+from tests.scenes import add_square, build, icosphere, load, sky
 
 F64 = NDArray[np.float64]
 INSIDE = np.array([[-0.5, -0.4, 0.3], [0.6, 0.7, -0.8], [0, 0, 0]])
@@ -54,7 +54,7 @@ def ball() -> Part:
 
 def proven(writer: GlbWriter) -> bool:
     scene = load(writer)
-    return is_sealed(scene, INSIDE - scene.origin)
+    return is_sealed(scene, build(scene), INSIDE - scene.origin)
 
 
 TURNED = [[0.6, 0, 0.8, 0.1], [0, -1.5, 0, 0.1], [-0.8, 0, 0.6, 0.1], [0, 0, 0, 1]]
@@ -139,7 +139,7 @@ def test_no_ray_gets_out(tmp_path: Path, image: bool) -> None:
     bundle = bake_example(folders["sealed"], example, environment=bright)
     assert any("sealed off" in x["why"] for x in bundle.manifest["left_out"])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bake_core.bake.is_sealed", lambda scene, positions: False)
+        patch.setattr("bake_core.bake.is_sealed", lambda scene, tracer, positions: False)
         unproven = bake_example(folders["open"], example, environment=bright)
     assert not any("sealed off" in x["why"] for x in unproven.manifest["left_out"])
     np.testing.assert_array_equal(maps(bundle), maps(dark))
