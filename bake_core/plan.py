@@ -17,7 +17,9 @@ from bake_core.scene import Scene
 from bake_core.selection import LeftOut
 from bake_core.spec import Spec, Stop
 
-# Probes that are traced to learn a scene's speed and noise, spread evenly over the bake; each gets the samples of a bake's own pilot.
+F64 = NDArray[np.float64]
+
+# Probes that are traced to learn a scene's speed and noise; each gets the samples of a bake's own pilot.
 _PILOT_PROBES = 32
 # An Embree 4 acceleration structure of triangles, of medium quality and robust, with its share of construction: bytes a triangle.
 _BVH_BYTES = 150
@@ -81,27 +83,37 @@ class Pilot:
 
     Attributes
     ----------
-    sample_seconds, distance_seconds : float
-        What a sample of every texel of one probe takes, and what its distances take; the mean of active and inactive ones.
-    variance : (p,) float64
+    seconds : (p,) float64
+        What a sample of every texel of each takes; next to nothing inside a solid.
+    distance_seconds : float
+        What the distances of one take.
+    active : (p,) bool
+    variance : (a,) float64
         Of those that are active: relative, as the error figure has it, after the pilot's samples.
     degrees : int
         Of freedom, of each.
     fall : float
         The power of 1/n with which variances fell from the pilot's first half to its end, within what is possible.
     allocation : Allocation
-        What these probes have had, and what they are to have.
+        What active ones have had, and what they are to have.
     times : float
-        How many times as many active probes the bake has.
+        How many times as many probes the bake traces.
     """
 
-    sample_seconds: float
+    seconds: F64
     distance_seconds: float
-    variance: NDArray[np.float64]
+    active: NDArray[np.bool_]
+    variance: F64
     degrees: int
     fall: float
     allocation: Allocation
     times: float
+
+    def cost(self, taken: F64) -> F64:
+        """(p,) float64: seconds for each probe, where active ones take so many samples, (a,)."""
+        out = np.full(len(self.seconds), self.distance_seconds)
+        out[self.active] += taken * self.seconds[self.active]
+        return out
 
 
 def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> Plan:
@@ -118,9 +130,9 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     check_finite(prepared, threads=threads)
     pilot = trace_pilot(prepared, threads)
     samples, taken = samples_needed(spec.stop, pilot)
-    doubt = _doubt(pilot)
-    _, least = samples_needed(spec.stop, replace(pilot, variance=pilot.variance / doubt))
-    _, greatest = samples_needed(spec.stop, replace(pilot, variance=pilot.variance * doubt, fall=1.0))
+    noise, pace = doubt(pilot.variance, pilot.times), doubt(pilot.cost(taken), pilot.times)
+    _, least = samples_needed(spec.stop, replace(pilot, variance=pilot.variance / noise))
+    _, greatest = samples_needed(spec.stop, replace(pilot, variance=pilot.variance * noise, fall=1.0))
     _, most = samples_needed(spec.stop.model_copy(update={"target_error": None}), pilot)
     one = empty_state(replace(prepared, positions=prepared.positions[:1], needed=prepared.needed[:1]))
     state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
@@ -130,9 +142,10 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     stored = sum(size * int(prepared.needed[a:b].sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True))
     traced = int(prepared.needed.sum())
 
-    def seconds(taken: float) -> float:
-        return traced * (pilot.distance_seconds + taken * pilot.sample_seconds)
+    def seconds(taken: F64) -> float:
+        return traced * float(pilot.cost(taken).mean()) if traced else 0.0
 
+    per_sample = float(pilot.seconds.mean()) if traced else 0.0
     return Plan(
         volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),
         probes=n,
@@ -140,75 +153,90 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
         left_out=prepared.left_out,
         unneeded_probes=n - int(asked.sum()),
         unneeded_bytes=sum(size * int((~asked[a:b]).sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)),
-        paths_per_second=s.capture**2 / pilot.sample_seconds,
+        paths_per_second=float(pilot.active.mean()) * s.capture**2 / per_sample if per_sample else 0.0,
         pilot_error=error_bound(pilot.variance, pilot.degrees, pilot.times),
         samples=samples,
         seconds=seconds(taken),
-        least_seconds=seconds(least),
-        greatest_seconds=seconds(greatest),
+        least_seconds=seconds(least) / pace,
+        greatest_seconds=seconds(greatest) * pace,
         most_seconds=seconds(most),
         memory_bytes=int(_BASE_BYTES + scene.triangle_count * _BVH_BYTES + scene.positions.nbytes * 3 + 2 * state_bytes + 2 * stored),
         atlas_bytes=stored,
     )
 
 
-def samples_needed(stop: Stop, pilot: Pilot) -> tuple[int, float]:
-    """How many samples the hardest probes will have had, and how many an active one on average, when the bake stops.
+def samples_needed(stop: Stop, pilot: Pilot) -> tuple[int, F64]:
+    """How many samples the hardest probes will have had, and each active one of the pilot, (a,), when the bake stops.
 
     The bake's own passes and its own decisions, about errors that fall from the pilot's as its rate says.
     """
     given = pilot.allocation
     if stop.target_error is None:
-        return stop.max_samples, float(stop.max_samples)
+        return stop.max_samples, np.full(len(given.taken), float(stop.max_samples))
     samples, error = 0, None
     while True:
         samples = next_pass(stop, samples, error)[1]
-        taken = (
-            np.maximum(given.taken, given.spans((0, samples))[..., 1])
-            if samples > PILOT_SAMPLES
-            else np.full_like(given.taken, samples // 2)
-        )
-        mean = taken.sum(1)
+        taken = np.full(len(given.taken), float(samples))
+        if samples > PILOT_SAMPLES:
+            taken = given.spans((0, samples))[..., 1].sum(1).astype(np.float64)
         if samples >= SCRAMBLES:
-            error = error_bound(pilot.variance * (PILOT_SAMPLES / np.maximum(mean, 1)) ** pilot.fall, pilot.degrees, pilot.times)
+            error = error_bound(pilot.variance * (PILOT_SAMPLES / taken) ** pilot.fall, pilot.degrees, pilot.times)
         if decide(stop, samples, error, 0.0) != "continue":
-            return samples, float(mean.mean()) if len(mean) else float(samples)
+            return samples, taken
 
 
-def _doubt(pilot: Pilot) -> float:
-    """By what factor the mean of the probes' variances may differ from that of all probes: half a 95 % interval of its logarithm."""
-    n, mean = len(pilot.variance), float(pilot.variance.mean()) if len(pilot.variance) else 0.0
+def doubt(values: F64, times: float) -> float:
+    """By what factor the mean of a few probes' values may differ from that of all: half a 95 % interval of its logarithm.
+
+    Parameters
+    ----------
+    values : (p,) float64
+        Not negative.
+    times : float
+        How many times as many there are: of all of them, the mean is no sample's.
+    """
+    n, mean = len(values), float(values.mean()) if len(values) else 0.0
     if n < 2 or mean <= 0:
         return 1.0
-    return math.exp(math.sqrt(float(f95(1.0, float(n - 1)))) * float(pilot.variance.std(ddof=1)) / mean / math.sqrt(n))
+    return math.exp(math.sqrt(float(f95(1.0, float(n - 1))) * (1 - 1 / times) / n) * float(values.std(ddof=1)) / mean)
 
 
 def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
-    """Trace probes spread evenly through the bake."""
+    """Trace probes drawn at random, one from each of as many parts of the bake, one after the other."""
     wanted = np.flatnonzero(prepared.needed)
-    chosen = wanted[np.unique(np.linspace(0, len(wanted) - 1, min(_PILOT_PROBES, len(wanted))).astype(int))]
+    count = min(_PILOT_PROBES, len(wanted))
+    if not count:
+        nothing = np.zeros(0)
+        return Pilot(nothing, 0.0, np.zeros(0, np.bool_), nothing, 1, 1.0, Allocation.start(0), 1.0)
+    # Every so-many-th would be a diagonal through the grid.
+    within = np.random.default_rng(prepared.spec.seed).random(count)
+    chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
     few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen], needed=prepared.needed[chosen])
-    state, given = empty_state(few), Allocation.start(len(chosen))
-    seconds, errors = [], []
-    for samples in ((0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)):
-        started = time.perf_counter()
-        state.add([trace_shard(few, (0, len(chosen)), samples, given, threads=threads)])
-        seconds.append(max(time.perf_counter() - started, 1e-9) / max(len(chosen), 1))
+    state, given = empty_state(few), Allocation.start(count)
+    seconds, errors = np.zeros((2, count)), []
+    for half, samples in enumerate(((0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES))):
+        tallies = []
+        for probe in range(count):
+            started = time.perf_counter()
+            tallies.append(trace_shard(few, (probe, probe + 1), samples, given, threads=threads))
+            seconds[half, probe] = time.perf_counter() - started
+        state.add(tallies)
         given = state.allocation
         errors.append(state.spread())
     state.allocate(prepared.spec.stop)
     active = state.active()
     early, late = errors
-    assert early is not None and late is not None
-    a, b = early.relative(), late.relative()
-    fell = math.log2(a.mean() / b.mean()) if len(b) and b.mean() > 0 else 1.0
+    assert late is not None
+    before, after = (found.relative() if found is not None else np.zeros(0) for found in (early, late))
+    fell = math.log2(before.mean() / after.mean()) if len(after) and after.mean() > 0 else 1.0
     # Both passes drew as many samples; the first looked for distances, too.
     return Pilot(
-        sample_seconds=seconds[1] / (PILOT_SAMPLES // 2),
-        distance_seconds=max(seconds[0] - seconds[1], 0.0),
-        variance=b,
+        seconds=seconds[1] / (PILOT_SAMPLES // 2),
+        distance_seconds=max(float((seconds[0] - seconds[1]).mean()), 0.0),
+        active=active,
+        variance=after,
         degrees=late.degrees,
         fall=min(max(fell, 1.0), _STEEPEST),
         allocation=Allocation(state.taken[active], state.eighths[active]),
-        times=len(wanted) / max(len(chosen), 1),
+        times=len(wanted) / count,
     )

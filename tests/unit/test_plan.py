@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from bake_core.examples import closed_box, cornell
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.images import read_exr
 from bake_core.placement import place
-from bake_core.plan import Pilot, plan, samples_needed
+from bake_core.plan import Pilot, doubt, plan, samples_needed
 from bake_core.scene import Scene
 from bake_core.selection import Selection, select
 from bake_core.spec import OUTPUTS, Stop, parse_spec
@@ -101,6 +102,7 @@ def test_a_plan_says_what_the_bake_then_does(tmp_path: Path) -> None:
         stored += pixels[..., 0].size * len(atlas["channels"]) * (2 if half else 4)
     assert made.atlas_bytes == stored
     assert made.paths_per_second > 1e4 and made.memory_bytes > made.atlas_bytes
+    # All eight are the pilot, so that nothing is in doubt.
     assert made.least_seconds == made.seconds == made.greatest_seconds == made.most_seconds >= 8 * 256 * 4 / made.paths_per_second
     demanded = bake(tmp_path / "scene.glb", wanted.model_copy(update={"outputs": OUTPUTS}), tmp_path / "all").manifest
     sizes = {}
@@ -155,7 +157,8 @@ def pilot(error: float, *, fall: float = 1.0, probes: int = 8, **changes: Any) -
     variance = np.ones(probes)
     variance *= (error / error_bound(variance, 14, 4.0)) ** 2
     taken = np.full((probes, HALVES), PILOT_SAMPLES // HALVES)
-    made = Pilot(1.0, 0.0, variance, 14, fall, Allocation(taken, np.full((probes, HALVES), FULL)), 4.0)
+    everybody = np.ones(probes, np.bool_)
+    made = Pilot(np.ones(probes), 0.5, everybody, variance, 14, fall, Allocation(taken, np.full((probes, HALVES), FULL)), 4.0)
     return replace(made, **changes)
 
 
@@ -171,7 +174,8 @@ def pilot(error: float, *, fall: float = 1.0, probes: int = 8, **changes: Any) -
     ],
 )
 def test_samples_that_a_pilot_asks_for(stop: Stop, error: float, fall: float, samples: int) -> None:
-    assert samples_needed(stop, pilot(error, fall=fall)) == (samples, samples)
+    found, taken = samples_needed(stop, pilot(error, fall=fall))
+    assert found == samples and (taken == samples).all()
 
 
 def test_probes_that_get_less_make_a_bake_shorter() -> None:
@@ -179,13 +183,28 @@ def test_probes_that_get_less_make_a_bake_shorter() -> None:
     given = pilot(0.05).allocation
     given.eighths[4:] = 1
     variance = pilot(0.05).variance * np.repeat([2.0, 1e-3], 4)
-    samples, taken = samples_needed(Stop(target_error=0.01, max_samples=256), pilot(0.05, variance=variance, allocation=given))
-    assert (samples, taken) == (256, (256 + 32) / 2)
+    few = pilot(0.05, variance=variance, allocation=given, active=np.arange(9) < 8, seconds=np.arange(9.0))
+    samples, taken = samples_needed(Stop(target_error=0.01, max_samples=256), few)
+    assert samples == 256 and taken.tolist() == [256] * 4 + [32] * 4
+    # The ninth is inside a solid.
+    assert few.cost(taken).tolist() == [0.5 + 256 * i for i in range(4)] + [0.5 + 32 * i for i in range(4, 8)] + [0.5]
 
 
 def test_no_active_probe_is_done_at_once() -> None:
     nobody = pilot(0.05, variance=np.zeros(0), allocation=Allocation.start(0))
-    assert samples_needed(Stop(target_error=0.01), nobody) == (16, 16)
+    assert samples_needed(Stop(target_error=0.01), nobody)[0] == 16
+
+
+def test_a_few_probes_leave_doubt_and_all_of_them_none() -> None:
+    """Of intervals about the mean of 32 skewed values, about 95 % hold the mean of the 3,200 that they are of."""
+    random = np.random.default_rng(0)
+    held = []
+    for _ in range(400):
+        values = random.lognormal(0, 0.8, 3200)
+        few = random.choice(values, 32, replace=False)
+        held.append(abs(math.log(few.mean() / values.mean())) <= math.log(doubt(few, 100.0)))
+    assert 0.9 <= np.mean(held) <= 0.98
+    assert doubt(np.arange(5.0), 1.0) == 1.0 and doubt(np.ones(1), 9.0) == 1.0 and doubt(np.zeros(4), 9.0) == 1.0
 
 
 def test_a_large_grid_is_planned_without_its_sums_and_refused_by_name_where_they_do_not_fit() -> None:

@@ -138,6 +138,18 @@ def test_a_plan_says_what_could_be_left_out() -> None:
     assert does.seconds < could.seconds
 
 
+def test_a_scene_without_surfaces_needs_no_probe(tmp_path: Path) -> None:
+    w = GlbWriter()
+    w.node("empty")
+    grid = {"origin": [0, 0, 0], "spacing": [1, 1, 1], "counts": [2, 2, 2]}
+    spec = {"volumes": [grid], "receivers": "surfaces", "environment": {"kind": "constant", "radiance": [1, 1, 1]}}
+    made = plan(load(w), parse_spec(spec), threads=1)
+    assert made.unneeded_probes == 8 and made.seconds == 0 and made.atlas_bytes == 0
+    bundle = bake_example(tmp_path, (w.to_glb(), spec))
+    assert bundle.volumes[0].states.tolist() == [2] * 8 and bundle.manifest["error"]["value"] == 0
+    assert not sample(bundle.volumes, [[0.5, 0.5, 0.5]], [[0.0, 1.0, 0.0]]).irradiance.any()
+
+
 def test_a_surface_outside_is_the_nearest_cells() -> None:
     """A border's cells reach outwards without end: a plane 1 m below is what a probe in the open is asked about."""
     glb, spec = plane_under_sun()
