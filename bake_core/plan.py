@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from bake_core.environment import Find, no_images
 from bake_core.scene import Scene
 from bake_core.selection import LeftOut
 from bake_core.spec import Spec, Stop
+from bake_core.tally import Tally
 
 F64 = NDArray[np.float64]
 
@@ -84,7 +86,7 @@ class Pilot:
     Attributes
     ----------
     seconds : (p,) float64
-        What a sample of every texel of each takes; next to nothing inside a solid.
+        What a sample of every texel of each takes; nothing inside a solid.
     distance_seconds : float
         What the distances of one take.
     active : (p,) bool
@@ -202,7 +204,7 @@ def doubt(values: F64, times: float) -> float:
 
 
 def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
-    """Trace probes drawn at random, one from each of as many parts of the bake, one after the other."""
+    """Trace probes drawn at random, one from each of as many parts of the bake."""
     wanted = np.flatnonzero(prepared.needed)
     count = min(_PILOT_PROBES, len(wanted))
     if not count:
@@ -212,27 +214,26 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     within = np.random.default_rng(prepared.spec.seed).random(count)
     chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
     few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen], needed=prepared.needed[chosen])
-    state, given = empty_state(few), Allocation.start(count)
-    seconds, errors = np.zeros((2, count)), []
-    for half, samples in enumerate(((0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES))):
-        tallies = []
-        for probe in range(count):
-            started = time.perf_counter()
-            tallies.append(trace_shard(few, (probe, probe + 1), samples, given, threads=threads))
-            seconds[half, probe] = time.perf_counter() - started
-        state.add(tallies)
-        given = state.allocation
-        errors.append(state.spread())
+    state, start = empty_state(few), Allocation.start(count)
+    first, second = (0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)
+    # No sample at all: distances alone.
+    looked, looking = _timed(lambda: trace_shard(few, (0, count), (0, 0), start, threads=threads))
+    alone = [trace_shard(few, (probe, probe + 1), first, start, threads=threads) for probe in range(count)]
+    state.add(alone)
+    early = state.spread()
+    together, tracing = _timed(lambda: trace_shard(few, (0, count), second, state.allocation, threads=threads))
+    state.add([together])
+    late = state.spread()
+    # Probe by probe there is more to do than rays; together they are as fast as a bake's, and each has its share of the rays.
+    rays = np.array([t.rays for t in alone]) - looked.rays / count
     state.allocate(prepared.spec.stop)
     active = state.active()
-    early, late = errors
-    assert late is not None
-    before, after = (found.relative() if found is not None else np.zeros(0) for found in (early, late))
+    assert early is not None and late is not None
+    before, after = early.relative(), late.relative()
     fell = math.log2(before.mean() / after.mean()) if len(after) and after.mean() > 0 else 1.0
-    # Both passes drew as many samples; the first looked for distances, too.
     return Pilot(
-        seconds=seconds[1] / (PILOT_SAMPLES // 2),
-        distance_seconds=max(float((seconds[0] - seconds[1]).mean()), 0.0),
+        seconds=tracing / (second[1] - second[0]) * rays / max(rays.sum(), 1),
+        distance_seconds=looking / count,
         active=active,
         variance=after,
         degrees=late.degrees,
@@ -240,3 +241,8 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
         allocation=Allocation(state.taken[active], state.eighths[active]),
         times=len(wanted) / count,
     )
+
+
+def _timed(trace: Callable[[], Tally]) -> tuple[Tally, float]:
+    started = time.perf_counter()
+    return trace(), time.perf_counter() - started
