@@ -18,6 +18,7 @@ COMMANDS = (
     "info",
     "sample",
     "verify",
+    "trace-check",
     "stability",
     "bench",
     "serve",
@@ -37,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(prog="octobake", description="Server-side global-illumination baking.", epilog=EXIT_CODES)
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        importlib.import_module(f"service.cli.{name}").add(commands)
+        importlib.import_module(f"service.cli.{name.replace('-', '_')}").add(commands)
     return top
 
 
