@@ -59,8 +59,12 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
         As the bake would.
     """
     prepared = prepare(scene, spec, find)
-    n, s = prepared.probe_count, prepared.selection
-    speed = _paths_per_second(prepared, threads)
+    return predict(prepared, _paths_per_second(prepared, threads))
+
+
+def predict(prepared: Prepared, speed: float) -> Plan:
+    """Predict a bake that traces so many paths a second."""
+    scene, spec, n, s = prepared.scene, prepared.spec, prepared.probe_count, prepared.selection
     one = empty_state(replace(prepared, positions=prepared.positions[:1]))
     state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
     texels = {

@@ -6,12 +6,17 @@ import fcntl
 import shutil
 
 from bake_core.errors import MachineError
+from service.audit import Audit
 from service.blobs import Blobs
 from service.hub import Hub
+from service.outbox import Outbox
+from service.retention import Retention
 from service.scenes import Outlines
 from service.scheduler import Scheduler
 from service.settings import Settings
 from service.store import Store
+from service.tokens import Tokens
+from service.webhooks import Webhooks
 
 
 class Service:
@@ -38,14 +43,28 @@ class Service:
         self.store = Store(settings.database_url)
         self.outlines = Outlines(self.blobs)
         self.hub = Hub()
+        self.audit = Audit(folder)
+        self.tokens = Tokens(self.store.engine)
+        self.outbox = Outbox(self.store.engine)
+        self.retention = Retention(settings, self.store, self.blobs)
+        self.webhooks = Webhooks(settings, self.store.engine)
         self.scheduler = Scheduler(settings, self.store, self.blobs, self.hub)
+
+    def start(self) -> None:
+        """Take up the work, and what goes on beside it."""
+        self.scheduler.start()
+        self.webhooks.start()
+        self.retention.start()
 
     def close(self) -> None:
         """Stop the work, leave it to be resumed, and let go of the data folder."""
         try:
+            self.retention.close()
             self.scheduler.close()
+            self.webhooks.close()
         finally:
             self.store.close()
+            self.audit.close()
             self._sweep()
             self._lock.close()
 

@@ -12,7 +12,24 @@ from collections.abc import Sequence
 from bake_core.errors import OctobakeError
 
 # In the order of --help. A command's module imports what it needs inside `run`, so that `octobake status` does not wait for numba.
-COMMANDS = ("bake", "plan", "info", "sample", "verify", "stability", "serve", "submit", "wait", "status", "list", "cancel", "fetch", "demo")
+COMMANDS = (
+    "bake",
+    "plan",
+    "info",
+    "sample",
+    "verify",
+    "stability",
+    "serve",
+    "submit",
+    "wait",
+    "status",
+    "list",
+    "cancel",
+    "stop",
+    "fetch",
+    "token",
+    "demo",
+)
 EXIT_CODES = "exit codes: 0 done; 2 bad input or usage; 3 failed; 4 out of budget before the target error; 5 a verification failed"
 
 

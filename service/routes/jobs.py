@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.documents import Page
+from service.joblog import log_lines
 from service.jobs import FINISHED, Job, Kind, State
 from service.parts import Service
 from service.problems import RequestError
+from service.routes.accept import RETRY_AFTER, WAIT_HEADER, wait_as_asked
 from service.routes.common import Here, failures, unknown
 from service.routes.events import event_stream
 
 Document = TypeVar("Document", bound=BaseModel)
-# Seconds after which a client that polls does well to ask again.
-RETRY_AFTER = "1"
 
 
 class Filter(BaseModel):
@@ -45,23 +46,25 @@ def find(service: Service, kind: Kind, job: str) -> Job:
 def not_there(job: Job, what: str) -> RequestError:
     """409: a file of a job that has not finished yet, or that never made one."""
     where = f"{job.kind} {job.id}"
+    if job.state == State.EXPIRED:
+        return RequestError("job.expired", f"the {job.kind}'s time is up, and its files are gone; requeue it, or pin the next", where, 410)
     if job.state in FINISHED:
         return RequestError("job.no_result", f"the {job.kind} has {job.state}, so there is no {what}", where, 409)
     headers = {"Retry-After": RETRY_AFTER}
     return RequestError("job.not_finished", f"the {job.kind} is {job.state}; its {what} comes when it has succeeded", where, 409, headers)
 
 
-def accepted(service: Service, response: Response, job: Job, path: str) -> None:
-    """202's headers; and the scheduler hears of the job."""
-    response.headers["Location"] = f"{path}/{job.id}"
-    response.headers["Retry-After"] = RETRY_AFTER
-    service.scheduler.wake()
-
-
-def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], document: Callable[[Service, Job, bool], Document]) -> None:
+def add_job_routes(
+    router: APIRouter,
+    kind: Kind,
+    model: type[Document],
+    document: Callable[[Service, Job, bool], Document],
+    needs: Callable[[Service, Job], Collection[str]],
+) -> None:
     """Add the routes that do not depend on what a job does.
 
-    `document` makes a job's JSON; its third argument says whether it stands in a list, where long parts are left out.
+    `document` makes a job's JSON; its third argument says whether it stands in a list, where long parts are left out. `needs` names the
+    files that a job is to be repeated with, and raises where one of them is gone.
     """
     name, noun = kind.capitalize(), str(kind)
 
@@ -79,11 +82,12 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
         following = base64.urlsafe_b64encode(str(jobs[-1].sequence).encode()).decode() if more else None
         return Page(items=[document(service, job, True) for job in jobs], next=following)
 
-    def get_job(id: str, service: Here, response: Response) -> Document:
-        job = find(service, kind, id)
+    async def get_job(id: str, request: Request, service: Here, response: Response) -> Document:
+        job = await run_in_threadpool(find, service, kind, id)
+        job = await wait_as_asked(service, request, response, job)
         if job.state not in FINISHED:
             response.headers["Retry-After"] = RETRY_AFTER
-        return document(service, job, False)
+        return await run_in_threadpool(document, service, job, False)
 
     def cancel_job(id: str, service: Here) -> Document:
         find(service, kind, id)
@@ -95,13 +99,36 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
         service.scheduler.cancel(id)
         return document(service, job, False)
 
+    def requeue_job(id: str, service: Here) -> Document:
+        job = find(service, kind, id)
+        if service.scheduler.drives(id):
+            # Its sums are being swept away; a new try must not begin under the broom.
+            headers = {"Retry-After": RETRY_AFTER}
+            raise RequestError("job.not_finished", f"the {kind} is still being tidied up", f"{kind} {id}", 409, headers)
+        job = service.store.requeue(id, needs(service, job))
+        service.hub.tell(id)
+        service.scheduler.wake()
+        return document(service, job, False)
+
+    def pin_job(id: str, service: Here) -> Document:
+        find(service, kind, id)
+        return document(service, service.store.pin(id, True), False)
+
+    def unpin_job(id: str, service: Here) -> Document:
+        find(service, kind, id)
+        return document(service, service.store.pin(id, False), False)
+
+    def job_log(id: str, service: Here) -> Response:
+        find(service, kind, id)
+        return PlainTextResponse("".join(f"{line}\n" for line in log_lines(service.store, id)))
+
     async def job_events(id: str, request: Request, service: Here) -> Response:
         await run_in_threadpool(find, service, kind, id)
         return event_stream(request, service, id)
 
     sse: dict[int | str, dict[str, Any]] = {
         200: {
-            "description": "`state`, `pass` and `retry` events with ids; `progress` without.",
+            "description": "`state`, `plan`, `pass`, `stop` and `retry` events with ids; `progress` without.",
             "content": {"text/event-stream": {"schema": {"type": "string"}}},
         }
     }
@@ -117,7 +144,44 @@ def add_job_routes(router: APIRouter, kind: Kind, model: type[Document], documen
         response_model=model,
         responses=failures(404),
     )
-    add("/{id}", get_job, operation_id=f"get{name}", summary=f"A {noun}", response_model=model, responses=failures(404))
+    for verb, call, summary, text, statuses in (
+        (
+            "requeue",
+            requeue_job,
+            "Try again a",
+            "One that has failed, was cancelled or has expired begins anew, under its own id.",
+            (404, 409, 422),
+        ),
+        ("pin", pin_job, "Keep the files of a", "No clean-up takes the files of a pinned one.", (404,)),
+        ("unpin", unpin_job, "Let go of the files of a", "Its time counts again.", (404,)),
+    ):
+        add(
+            f"/{{id}}:{verb}",
+            call,
+            methods=["POST"],
+            operation_id=f"{verb}{name}",
+            summary=f"{summary} {noun}",
+            description=text,
+            response_model=model,
+            responses=failures(*statuses),
+        )
+    add(
+        "/{id}",
+        get_job,
+        operation_id=f"get{name}",
+        summary=f"A {noun}",
+        response_model=model,
+        openapi_extra={"parameters": [WAIT_HEADER]},
+        responses=failures(404),
+    )
+    add(
+        "/{id}/log",
+        job_log,
+        operation_id=f"get{name}Log",
+        summary=f"What happened to a {noun}, a line each",
+        response_class=PlainTextResponse,
+        responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **failures(404)},
+    )
     add(
         "/{id}/events",
         job_events,
