@@ -89,8 +89,20 @@ def _complete(document: dict[str, Any]) -> None:
             operation["security"] = [{"token": [scope]}, {}] if scope else []
             common = (401, 403, 429, 500, 503) if scope else (429, 500, 503)
             operation["responses"] |= {str(status): answer for status, answer in failures(*common).items()}
+            if method == "post" and path in ("/v1/bakes", "/v1/verifications"):
+                operation["responses"]["202"]["links"] = _links(document, f"{path}/{{id}}")
             if "HTTPValidationError" in str(operation["responses"].get("422")):
                 del operation["responses"]["422"]
+
+
+def _links(document: dict[str, Any], below: str) -> dict[str, Any]:
+    """What can be asked of a job that was just accepted."""
+    return {
+        operation["operationId"]: {"operationId": operation["operationId"], "parameters": {"id": "$response.body#/id"}}
+        for path, operations in document["paths"].items()
+        for operation in operations.values()
+        if path.startswith(below) and "{name}" not in path
+    }
 
 
 def _replace_marks(value: Any) -> None:

@@ -14,8 +14,10 @@ from service.routes.bodies import limited, receive
 from service.routes.common import Here, failures, unknown
 
 router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
-# Not a pattern here: a name that is no digest is a blob that cannot exist, which the handlers say in their own way.
-Name = Annotated[str, Path(description="`sha256:` and 64 hexadecimal digits, lower case.")]
+# In the document the pattern only: a name that is no digest is a blob that cannot exist, which the handlers say in their own way.
+Name = Annotated[
+    str, Path(description="`sha256:` and 64 hexadecimal digits, lower case.", json_schema_extra={"pattern": f"^{DIGEST.pattern}$"})
+]
 
 
 @router.head("/{digest}", operation_id="headBlob", summary="Is this blob here?", responses=failures(404, 422))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 from collections.abc import Callable, Collection
 from typing import Annotated, Any, TypeVar
 
@@ -11,8 +9,9 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.convertors import StringConvertor, register_url_convertor
 
-from service.documents import Page
+from service.documents import LABEL_KEY, PLAIN, Page
 from service.joblog import log_lines
 from service.jobs import FINISHED, Job, Kind, State
 from service.parts import Service
@@ -21,7 +20,19 @@ from service.routes.accept import RETRY_AFTER, WAIT_HEADER, wait_as_asked
 from service.routes.common import Here, failures, unknown
 from service.routes.events import event_stream
 
+
+class _JobConvertor(StringConvertor):
+    """An id has no colon: what follows one is a verb, which takes another method."""
+
+    regex = "[^/:]+"
+
+
+register_url_convertor("job", _JobConvertor())
 Document = TypeVar("Document", bound=BaseModel)
+
+
+# A key, a colon, a value.
+Label = Annotated[str, Field(pattern=f"{LABEL_KEY[:-1]}:{PLAIN[1:]}", max_length=320)]
 
 
 class Filter(BaseModel):
@@ -30,9 +41,9 @@ class Filter(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     state: State | None = None
-    label: list[str] = Field([], max_length=8, description="`key:value`; several must all hold.", examples=[["level:rooms"]])
+    label: list[Label] = Field([], max_length=8, description="`key:value`; several must all hold.", examples=[["level:rooms"]])
     limit: int = Field(50, ge=1, le=500)
-    cursor: str | None = Field(None, max_length=64, description="`next` of the page before.")
+    cursor: str | None = Field(None, pattern="^[1-9][0-9]{0,17}$", description="`next` of the page before.")
 
 
 def find(service: Service, kind: Kind, job: str) -> Job:
@@ -69,17 +80,12 @@ def add_job_routes(
     name, noun = kind.capitalize(), str(kind)
 
     def list_jobs(service: Here, asked: Annotated[Filter, Query()]) -> Page[Document]:
-        labels = {}
-        for label in asked.label:
-            key, colon, value = label.partition(":")
-            if not colon:
-                raise RequestError("request.invalid", "a label filter is key:value", "label", 422)
-            labels[key] = value
-        before = None if asked.cursor is None else _cursor(asked.cursor)
+        labels = dict(label.split(":", 1) for label in asked.label)
+        before = None if asked.cursor is None else int(asked.cursor)
         jobs = service.store.list_jobs(kind, state=asked.state, labels=labels, before=before, limit=asked.limit + 1)
         more = len(jobs) > asked.limit
         jobs = jobs[: asked.limit]
-        following = base64.urlsafe_b64encode(str(jobs[-1].sequence).encode()).decode() if more else None
+        following = str(jobs[-1].sequence) if more else None
         return Page(items=[document(service, job, True) for job in jobs], next=following)
 
     async def get_job(id: str, request: Request, service: Here, response: Response) -> Document:
@@ -166,7 +172,7 @@ def add_job_routes(
             responses=failures(*statuses),
         )
     add(
-        "/{id}",
+        "/{id:job}",
         get_job,
         operation_id=f"get{name}",
         summary=f"A {noun}",
@@ -192,14 +198,3 @@ def add_job_routes(
         responses={**sse, **failures(400, 404)},
         response_class=Response,
     )
-
-
-def _cursor(text: str) -> int:
-    try:
-        sequence = int(base64.urlsafe_b64decode(text.encode("ascii")))
-    except (ValueError, binascii.Error):
-        sequence = 0
-    # Beyond 63 bits no database has an integer.
-    if not 0 < sequence < 2**63:
-        raise RequestError("request.invalid", "is not a cursor that this service gave", "cursor", 422)
-    return sequence

@@ -232,7 +232,9 @@ def test_every_command_and_option_is_documented() -> None:
     sections = dict(zip(COMMANDS, re.split(r"^## octobake [a-z-]+$", text, flags=re.MULTILINE)[1:], strict=True))
     for name, command in commands().items():
         section = sections[name]
-        words = [w for a in command._actions if not isinstance(a, _HelpAction) for w in (a.option_strings or [str(a.metavar or a.dest)])]
+        verbs = [verb for a in command._actions if isinstance(a, _SubParsersAction) for verb in a.choices.values()]
+        actions = [a for c in (command, *verbs) for a in c._actions if not isinstance(a, _HelpAction)]
+        words = [w for a in actions for w in (a.option_strings or [str(a.metavar or a.dest)])]
         for word in words:
             # The service's settings have a page, and a test, of their own.
             if name != "serve" or word == "--ready-file":

@@ -18,8 +18,8 @@ from service.parts import Service
 from service.routes.guard import is_loopback, needed_scope
 from service.settings import Settings
 from service.tokens import Scope
-from tests.service.running import InProcess, box_spec, octobake
-from tests.service.test_http import BOX, problem
+from tests.service.running import BOX, InProcess, box_spec, octobake
+from tests.service.test_http import problem
 
 
 @pytest.fixture
