@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core import __version__
+from bake_core.allocation import SCRAMBLES
 from bake_core.atlas import choose_encoding, layout, pack
 from bake_core.bundle import CHANNELS, FORMAT, SHADERS, VERSION, Atlas, VolumeData, digest_file
-from bake_core.capture import SCRAMBLES
 from bake_core.convergence import Verdict
 from bake_core.embree import instruction_set
 from bake_core.errors import BakeError
@@ -40,6 +40,9 @@ PARAMETERS = {
 # Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
 # flat-wall variances come out negative). Distances are metres of any scale.
 _ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
+
+# As many as anybody would go and look at.
+_WORST_PROBES = 8
 
 
 def assemble(
@@ -81,11 +84,40 @@ def assemble(
         "spec": spec.canonical(),
         "samples": state.samples,
         "stopped": stopped,
-        "error": {"value": state.error(), "target": spec.stop.target_error, "scrambles": SCRAMBLES},
+        "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
+        "error": _error(spec, volumes, selection, state),
         "left_out": [{"what": what, "why": why} for what, why in selection.left_out],
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
+    }
+
+
+def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State) -> dict[str, Any]:
+    """DESIGN's figure, the same of each output that is sampled, and who errs most."""
+    probes = state.probe_errors()
+    measured = np.flatnonzero(np.isfinite(probes))
+    # Where two err alike the first comes first, on every machine.
+    worst = measured[np.argsort(-probes[measured], kind="stable")[:_WORST_PROBES]]
+    first = np.cumsum([0] + [v.probe_count for v in volumes])
+    rows = []
+    for flat in worst:
+        of = int(np.searchsorted(first, flat, "right")) - 1
+        probe = int(flat - first[of])
+        position = volumes[of].positions()[probe].tolist()
+        rows.append({"volume": volumes[of].name, "probe": probe, "position": position, "error": float(probes[flat])})
+    known = {"irradiance": state.error(), "radiance": state.radiance_error()}
+    return {
+        "value": state.error(),
+        "target": spec.stop.target_error,
+        "scrambles": SCRAMBLES,
+        # Visibility, distance and normal come from one ray through each texel's centre: nothing is drawn at random.
+        "outputs": [{"output": output, "value": known.get(output)} for output in selection.outputs],
+        "probes": {
+            "median": float(np.median(probes[measured])) if len(measured) else None,
+            "p95": float(np.percentile(probes[measured], 95)) if len(measured) else None,
+            "worst": rows,
+        },
     }
 
 
@@ -171,11 +203,11 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
     # Never a silent inf: what does not fit float32 is caught where maps are checked.
     with np.errstate(over="ignore"):
         if output == "irradiance":
-            # The covariance term is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard
+            # The control variate is unbiased, so where a texel is all but black, noise can take it below zero: by less than its standard
             # error.
-            mean = np.maximum(state.mean()[probes], 0)
+            mean = np.maximum(state.mean(probes), 0)
             return np.asarray(mean, np.float32).reshape(-1, selection.irradiance, selection.irradiance, 3)
-        return np.asarray(state.radiance[probes] / state.samples, np.float32).reshape(-1, selection.capture, selection.capture, 3)
+        return np.asarray(state.mean_radiance(probes), np.float32).reshape(-1, selection.capture, selection.capture, 3)
 
 
 def _write_layers(path: Path, texels: F32, output: str, *, half: bool) -> None:

@@ -2,7 +2,8 @@
 
 1. :func:`prepare`: place the probes, build what rays need.
 2. :func:`trace_shard`: one shard's part of one pass; any process may do it, in any order.
-3. :class:`bake_core.tally.State`: add a pass, measure the error; :func:`bake_core.convergence.decide` whether another follows.
+3. :class:`bake_core.tally.State`: add a pass, measure the error; :func:`bake_core.convergence.decide` whether another follows
+   (:func:`gather` does both, pass after pass).
 4. :func:`finish`: filter, pack, encode, write.
 
 :func:`bake` does it all here and now; the service does the same steps through its workers.
@@ -22,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core import bundle, report
+from bake_core.allocation import HALVES, SCRAMBLES, Allocation
 from bake_core.assemble import assemble
-from bake_core.capture import SCRAMBLES, Capture, capture_distance, capture_radiance
+from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, decide, fit_pass, next_pass
 from bake_core.endless import check_light_ends
@@ -112,11 +114,14 @@ def empty_state(prepared: Prepared) -> State:
         ``machine.no_memory``.
     """
     n, s = prepared.probe_count, prepared.selection
+    start = Allocation.start(n)
     try:
         return State(
             samples=0,
-            irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3)),
-            radiance=np.zeros((n, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0)),
+            taken=start.taken,
+            eighths=start.eighths,
+            irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3), np.float32),
+            radiance=np.zeros((n, HALVES, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0, 0), np.float32),
             visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
             backface=np.zeros(n, np.float32),
             distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
@@ -133,6 +138,7 @@ def trace_shard(
     prepared: Prepared,
     probes: tuple[int, int],
     samples: tuple[int, int],
+    allocation: Allocation,
     *,
     threads: int,
     cancelled: NDArray[np.uint8] | None = None,
@@ -144,6 +150,8 @@ def trace_shard(
     ----------
     probes, samples : (int, int)
         Half-open ranges. The pass that starts at sample 0 also captures distances.
+    allocation : Allocation
+        What each probe of the bake has had before this pass, and what part of it each gets.
     cancelled : (1,) uint8, optional
         Set it to 1 from any thread: the kernels stop within one texel.
     advance : callable
@@ -158,16 +166,18 @@ def trace_shard(
     positions = np.ascontiguousarray(prepared.positions[slice(*probes)])
     ids = np.arange(*probes, dtype=np.uint64)
     capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
+    spans = allocation.spans(samples, slice(*probes))
     irradiance, radiance, rays = capture_radiance(
-        prepared.tracer, positions, ids, samples, capture, threads=threads, cancelled=flag, advance=advance
+        prepared.tracer, positions, ids, spans, capture, threads=threads, cancelled=flag, advance=advance
     )
     empty = np.zeros
     seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else ({}, 0)
     return Tally(
         *probes,
         *samples,
-        irradiance,
-        radiance,
+        taken=spans[..., 1],
+        irradiance=_stored(irradiance),
+        radiance=_stored(radiance),
         visibility=seen.get("visibility", empty((0, 0, 0, 0), np.float32)),
         backface=seen.get("backface", empty(0, np.float32)),
         distance=seen.get("distance", empty((0, 0), np.float32)),
@@ -176,9 +186,15 @@ def trace_shard(
     )
 
 
+def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Sums in single precision: 2⁻²⁴ of a value is far below what its samples know. What overflows is refused where maps are checked."""
+    with np.errstate(over="ignore"):
+        return sums.astype(np.float32)
+
+
 def compile_kernels(prepared: Prepared) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs: by tracing no probe at all."""
-    trace_shard(prepared, (0, 0), (0, 0), threads=1)
+    trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -221,6 +237,59 @@ def _see(
     with ThreadPoolExecutor(threads) as pool:
         parts, counts = zip(*pool.map(look, range(0, max(len(positions), 1), _DISTANCE_CHUNK)), strict=True)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, sum(counts)
+
+
+def gather(
+    prepared: Prepared,
+    run: Run,
+    clock: Clock,
+    *,
+    adaptive: bool = True,
+    point: Callable[[Point], None] = lambda point: None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> State:
+    """Pass after pass, until the spec says that it is enough.
+
+    Parameters
+    ----------
+    run : Run
+        Its threads and shards are taken; its curve and why it stopped are filled in.
+    adaptive, point, cancelled
+        As :func:`bake` has them.
+
+    Raises
+    ------
+    Cancelled
+        Before the first pass was whole.
+    """
+    stop, state = prepared.spec.stop, empty_state(prepared)
+    ranges = shard_ranges(prepared.probe_count, run.shards)
+    error: float | None = None
+    while run.stopped == "continue":
+        samples = fit_pass(stop, next_pass(stop, state.samples, error), run.curve, clock.elapsed)
+        if samples[0] == samples[1]:
+            run.stopped = "time"
+            break
+        clock.begin(samples, len(ranges))
+        given = state.allocation
+        try:
+            tallies = [
+                trace_shard(prepared, r, samples, given, threads=run.threads, cancelled=cancelled, advance=clock.advance) for r in ranges
+            ]
+        except Cancelled:
+            if not run.curve:
+                raise
+            run.stopped = "interrupt"
+            break
+        state.add(tallies)
+        if adaptive:
+            state.allocate(stop)
+        error, seconds = state.error(), clock.elapsed
+        run.curve.append(Point(state.samples, state.rays, seconds, error))
+        point(run.curve[-1])
+        clock.measured(state.samples, error)
+        run.stopped = decide(stop, state.samples, error, seconds)
+    return state
 
 
 def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, Any]:
@@ -268,6 +337,7 @@ def bake(
     threads: int = 1,
     shards: int = 1,
     find: Find = no_images,
+    adaptive: bool = True,
     progress: ProgressCallback | None = None,
     point: Callable[[Point], None] = lambda point: None,
     cancelled: NDArray[np.uint8] | None = None,
@@ -284,6 +354,8 @@ def bake(
         How the work is split; the bundle does not depend on it.
     find : callable, optional
         Where an image that the spec names lies.
+    adaptive : bool
+        Whether easy probes may get fewer samples, where there is an error to reach (:mod:`bake_core.allocation`).
     point : callable, optional
         Told each point of the curve of error against time as it is measured.
     cancelled : (1,) uint8, optional
@@ -307,27 +379,8 @@ def bake(
     compile_kernels(prepared)
     clock.stage("tracing")
     check_finite(prepared, threads=threads, cancelled=cancelled)
-    state, run = empty_state(prepared), Run(threads, shards, began=clock.elapsed)
-    ranges = shard_ranges(prepared.probe_count, shards)
-    while run.stopped == "continue":
-        samples = fit_pass(spec.stop, next_pass(spec.stop, state.samples), run.curve, clock.elapsed)
-        if samples[0] == samples[1]:
-            run.stopped = "time"
-            break
-        clock.begin(samples, len(ranges))
-        try:
-            tallies = [trace_shard(prepared, r, samples, threads=threads, cancelled=cancelled, advance=clock.advance) for r in ranges]
-        except Cancelled:
-            if not run.curve:
-                raise
-            run.stopped = "interrupt"
-            break
-        state.add(tallies)
-        error, seconds = state.error(), clock.elapsed
-        run.curve.append(Point(state.samples, state.rays, seconds, error))
-        point(run.curve[-1])
-        clock.measured(state.samples, error)
-        run.stopped = decide(spec.stop, state.samples, error, seconds)
+    run = Run(threads, shards, began=clock.elapsed)
+    state = gather(prepared, run, clock, adaptive=adaptive, point=point, cancelled=cancelled)
     clock.stage("writing")
     run.seconds, run.stages = clock.elapsed, clock.stages()
     manifest = finish(prepared, state, run, out)

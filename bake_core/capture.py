@@ -16,6 +16,7 @@ import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
+from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.embree import new_rayhit, rays_traced
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
@@ -29,9 +30,8 @@ from bake_core.transport import trace_path
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
-# Independent scrambles of every sample sequence. Their spread is the bake's error: Sobol' points themselves are not independent.
-SCRAMBLES = 4
 # A probe's capture texels are summed in this many blocks, which threads may share: fixed, so that sums are the same bits for any number
 # of threads.
 BLOCKS = 4
@@ -80,17 +80,17 @@ def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key,
     Parameters
     ----------
     rounds : (int, int)
-        Half-open range of samples, every SCRAMBLES-th of which is taken.
+        Half-open range of points of this scramble's sequence; one a round.
     rate : float
         Light samples a round over the whole probe.
-    irradiance : (m, 3) float64, added to
+    irradiance : (3, m) float64, added to
     """
     m = normals.shape[1]
     for i in range(m):
         lanes[0, i] = lanes[1, i] = lanes[2, i] = np.float32(0)
-    for sample in range(rounds[0], rounds[1], SCRAMBLES):
+    for point in range(rounds[0], rounds[1]):
         # One sequence over the whole probe: rounds follow one another in it, so a pass is one run of points.
-        reversed_index = reverse_bits(uint32((sample // SCRAMBLES * texels + texel) // _TEXELS_PER_LIGHT_SAMPLE))
+        reversed_index = reverse_bits(uint32((point * texels + texel) // _TEXELS_PER_LIGHT_SAMPLE))
         u, v = sobol_pair(reversed_index, key)
         if t.emitters.cdf.shape[0]:
             choice, _ = sobol_pair(reversed_index, key + uint64(1))
@@ -101,32 +101,49 @@ def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key,
         # Emitters and sky may share their numbers: each sum stays unbiased.
         _add_sample_of_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes)
     for i in range(m):
-        irradiance[i, 0] += lanes[0, i]
-        irradiance[i, 1] += lanes[1, i]
-        irradiance[i, 2] += lanes[2, i]
+        irradiance[0, i] += lanes[0, i]
+        irradiance[1, i] += lanes[1, i]
+        irradiance[2, i] += lanes[2, i]
+
+
+@kernel
+def _morton(row, column):  # type: ignore[no-untyped-def]
+    """Neighbours in two dimensions stay close in one: bits in turn (Morton 1966). Up to 2⁸ rows."""
+    code = 0
+    for bit in range(8):
+        code |= (column >> bit & 1) << (2 * bit) | (row >> bit & 1) << (2 * bit + 1)
+    return code
+
+
+@kernel
+def _points_of(span, j):  # type: ignore[no-untyped-def]
+    """The half-open range of points of the sequence of scramble j of a half that its samples [span[0], span[1]) are."""
+    return (span[0] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF, (span[1] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF
 
 
 @entry_kernel
-def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, normals, cosines, seed, cancelled, lanes, irradiance, radiance):  # type: ignore[no-untyped-def]
-    """Trace samples [first, end) through the capture texels of some blocks of every given probe.
+def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, cosines, seed, cancelled, room, irradiance, radiance):  # type: ignore[no-untyped-def]
+    """Trace each probe's samples through the capture texels of some of its blocks.
 
     Parameters
     ----------
     positions : (p, 3) float64, local frame
     ids : (p,) uint64
         What makes each probe's samples its own: its number in the bake, not in the shard.
+    spans : (p, HALVES, 2) int64
+        Half-open range of samples of each half; sample s is of scramble s % SCRAMBLES_PER_HALF of its half.
     normals : (3, m) float32
         Directions of the irradiance texels' normals.
     cosines : (resolution², m) float32
         Exact ∫ cosθ dω over each capture texel about each normal.
     blocks : (int, int)
         Half-open range out of BLOCKS.
-    lanes : (4, m) float32
-        Room to work in.
-    irradiance : (p, BLOCKS, SCRAMBLES, m, 3) float64, added to
+    room : (SCRAMBLES_PER_HALF + 1, 4, m) float32, (SCRAMBLES_PER_HALF, 4) float64
+        To work in.
+    irradiance : (p, BLOCKS, SCRAMBLES, 3, m) float64, added to
         Σ L cosθ · (solid angle per sample), per block and scramble.
-    radiance : (p, resolution², 3) float64 or (0, 0, 0), added to
-        Σ L per capture texel.
+    radiance : (p, HALVES, resolution², 3) float64 or (0, 0, 0, 0), added to
+        Σ L per half and capture texel.
 
     Notes
     -----
@@ -134,16 +151,19 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
     from
     the centre and is √3 times its projection.
 
-    A texel's part of irradiance is ∫ L f, with f = cosθ dω/dA, over its area. With F = ∫ f known exactly it is estimated from N samples as
+    A texel's part of irradiance is ∫ L f, with f = cosθ dω/dA, over its area. F = ∫ f is known exactly, which makes f a control variate
+    (Owen 2013, "Monte Carlo theory, methods and examples", section 8.9): scramble i estimates the texel's part as
 
-        mean(L) F + mean(L f) - mean(L) mean(f),
+        mean_i(L f) + L̄ (F - mean_i(f)),
 
-    the convolution with exact texel integrals plus the samples' covariance of radiance and cosine inside the texel. No texel size is left
-    in the result, and where L is constant it is exact at any N (a furnace tests it). Its bias is minus the covariance of mean(L) and
-    mean(f), and scrambled nets know the mean of a smooth f almost exactly: N^-3 of the texel's own covariance, 1.6 % at 4 samples. Bessel's
-    N/(N-1), right for independent samples, would overshoot by a third there.
+    the samples' own convolution, corrected for where in the texel they happened to fall. With a coefficient L̄ from the scramble's own
+    samples, one sample would be left with L F and no knowledge of how light and cosine go together inside the texel. L̄ is therefore the
+    mean over the other scrambles of the same half (cross-fitting; Avramidis and Wilson 1993, "A Splitting Scheme for Control Variates"):
+    independent of mean_i(f), whose mean is F, so nothing biases the sum, at any number of samples. Where L is constant it is exact (a
+    furnace tests it). Scrambles are no longer quite independent: the covariance of two is the square of one sample's cov(L, f) over 7².
     """
     ray_bits = ray.view(np.uint32)
+    lanes, light = room
     m = normals.shape[1]
     texels = resolution * resolution
     # Light samples a round: a round is one sample through every texel.
@@ -156,72 +176,89 @@ def _capture_kernel(t, ray, positions, ids, first, end, resolution, blocks, norm
             if cancelled[0]:
                 return _CANCELLED
             row, column = texel // resolution, texel % resolution
+            place = _morton(row, column)
             block = texel * BLOCKS // texels
-            total_r = total_g = total_b = 0.0
-            for scramble in range(SCRAMBLES):
-                key = mix64(probe_key + uint64(texel * SCRAMBLES + scramble))
-                for i in range(m):
-                    lanes[0, i] = lanes[1, i] = lanes[2, i] = lanes[3, i] = np.float32(0)
-                sum_r = sum_g = sum_b = 0.0
-                count = 0
-                # From the first sample of this scramble at or after `first`.
-                for sample in range(first + (scramble - first) % SCRAMBLES, end, SCRAMBLES):
-                    index = uint32(sample // SCRAMBLES)
-                    reversed_index = reverse_bits(index)
-                    u, v = sobol_pair(reversed_index, key)
-                    a = (column + float(u)) * 2 / resolution - 1
-                    b = (row + float(v)) * 2 / resolution - 1
-                    c = 1 - abs(a) - abs(b)
-                    fold = max(-c, 0.0)
-                    a += -fold if a >= 0 else fold
-                    b += -fold if b >= 0 else fold
-                    length = math.sqrt(a * a + b * b + c * c)
-                    dx, dy, dz = a / length, b / length, c / length
-                    density = texels / 4 * (length * length * length)
-                    emitted, direct, indirect, _, light_pdf = trace_path(
-                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, key, False, math.sqrt(1 / density)
-                    )
-                    red, green, blue = (
-                        emitted[0] + direct[0] + indirect[0],
-                        emitted[1] + direct[1] + indirect[1],
-                        emitted[2] + direct[2] + indirect[2],
-                    )
-                    total_r += red
-                    total_g += green
-                    total_b += blue
-                    count += 1
-                    solid_angle = np.float32(1 / density)
-                    # What light samples find too, they find better: the balance heuristic leaves this sample its share.
-                    share = density / (density + light_rate * light_pdf)
-                    red, green, blue = red - (1 - share) * emitted[0], green - (1 - share) * emitted[1], blue - (1 - share) * emitted[2]
-                    sum_r += red
-                    sum_g += green
-                    sum_b += blue
-                    fr, fg, fb = np.float32(red), np.float32(green), np.float32(blue)
-                    fx, fy, fz = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
+            for half in range(HALVES):
+                total_r = total_g = total_b = 0.0
+                drawn = 0.0
+                for j in range(SCRAMBLES_PER_HALF):
+                    scramble = half * SCRAMBLES_PER_HALF + j
+                    key = mix64(probe_key + uint64(texel * SCRAMBLES + scramble))
+                    path_key = mix64(probe_key + uint64((texels + 1) * SCRAMBLES + scramble))
                     for i in range(m):
-                        f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
-                        lanes[0, i] += f * fr
-                        lanes[1, i] += f * fg
-                        lanes[2, i] += f * fb
-                        lanes[3, i] += f
-                if count and sum_r + sum_g + sum_b > 0:
-                    mean_r, mean_g, mean_b = np.float32(sum_r / count), np.float32(sum_g / count), np.float32(sum_b / count)
-                    weight = np.float32(count)
-                    for i in range(m):
-                        missed = weight * cosines[texel, i] - lanes[3, i]
-                        irradiance[p, block, scramble, i, 0] += lanes[0, i] + mean_r * missed
-                        irradiance[p, block, scramble, i, 1] += lanes[1, i] + mean_g * missed
-                        irradiance[p, block, scramble, i, 2] += lanes[2, i] + mean_b * missed
-                if light_rate and texel % _TEXELS_PER_LIGHT_SAMPLE == 0:
-                    light_key = mix64(probe_key + uint64(texels * SCRAMBLES + scramble))
-                    rounds = (first + (scramble - first) % SCRAMBLES, end)
-                    into = irradiance[p, block, scramble]
-                    _sample_lights(t, ray, ray_bits, (x0, y0, z0), texel, texels, rounds, light_rate, light_key, normals, lanes, into)
-            if radiance.shape[0]:
-                radiance[p, texel, 0] += total_r
-                radiance[p, texel, 1] += total_g
-                radiance[p, texel, 2] += total_b
+                        lanes[j, 0, i] = lanes[j, 1, i] = lanes[j, 2, i] = lanes[j, 3, i] = np.float32(0)
+                    sum_r = sum_g = sum_b = 0.0
+                    first, end = _points_of(spans[p, half], j)
+                    for point in range(first, end):
+                        u, v = sobol_pair(reverse_bits(uint32(point)), key)
+                        # Bounces are stratified over the whole probe: one sequence for all its texels, of which a texel's samples of one
+                        # pass are a run, and neighbouring texels' runs follow one another.
+                        index = uint32(texels * first + place * (end - first) + point - first)
+                        reversed_index = reverse_bits(index)
+                        a = (column + float(u)) * 2 / resolution - 1
+                        b = (row + float(v)) * 2 / resolution - 1
+                        c = 1 - abs(a) - abs(b)
+                        fold = max(-c, 0.0)
+                        a += -fold if a >= 0 else fold
+                        b += -fold if b >= 0 else fold
+                        length = math.sqrt(a * a + b * b + c * c)
+                        dx, dy, dz = a / length, b / length, c / length
+                        density = texels / 4 * (length * length * length)
+                        emitted, direct, indirect, _, light_pdf = trace_path(
+                            t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, path_key, False, math.sqrt(1 / density)
+                        )
+                        red, green, blue = (
+                            emitted[0] + direct[0] + indirect[0],
+                            emitted[1] + direct[1] + indirect[1],
+                            emitted[2] + direct[2] + indirect[2],
+                        )
+                        if radiance.shape[0]:
+                            radiance[p, half, texel, 0] += red
+                            radiance[p, half, texel, 1] += green
+                            radiance[p, half, texel, 2] += blue
+                        solid_angle = np.float32(1 / density)
+                        # What light samples find too, they find better: the balance heuristic leaves this sample its share.
+                        share = density / (density + light_rate * light_pdf)
+                        red, green, blue = red - (1 - share) * emitted[0], green - (1 - share) * emitted[1], blue - (1 - share) * emitted[2]
+                        sum_r += red
+                        sum_g += green
+                        sum_b += blue
+                        fr, fg, fb = np.float32(red), np.float32(green), np.float32(blue)
+                        fx, fy, fz = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
+                        for i in range(m):
+                            f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
+                            lanes[j, 0, i] += f * fr
+                            lanes[j, 1, i] += f * fg
+                            lanes[j, 2, i] += f * fb
+                            lanes[j, 3, i] += f
+                    light[j, 0], light[j, 1], light[j, 2], light[j, 3] = sum_r, sum_g, sum_b, end - first
+                    total_r += sum_r
+                    total_g += sum_g
+                    total_b += sum_b
+                    drawn += end - first
+                for j in range(SCRAMBLES_PER_HALF):
+                    if light[j, 3] == 0:
+                        continue
+                    scramble = half * SCRAMBLES_PER_HALF + j
+                    if total_r + total_g + total_b > 0:
+                        # A scramble that is alone has nobody else to ask.
+                        others = drawn - light[j, 3]
+                        own = 1.0 if others > 0 else 0.0
+                        per = 1 / (others if others > 0 else drawn)
+                        mean_r = np.float32((total_r - own * light[j, 0]) * per)
+                        mean_g = np.float32((total_g - own * light[j, 1]) * per)
+                        mean_b = np.float32((total_b - own * light[j, 2]) * per)
+                        weight = np.float32(light[j, 3])
+                        for i in range(m):
+                            missed = weight * cosines[texel, i] - lanes[j, 3, i]
+                            irradiance[p, block, scramble, 0, i] += lanes[j, 0, i] + mean_r * missed
+                            irradiance[p, block, scramble, 1, i] += lanes[j, 1, i] + mean_g * missed
+                            irradiance[p, block, scramble, 2, i] += lanes[j, 2, i] + mean_b * missed
+                    if light_rate and texel % _TEXELS_PER_LIGHT_SAMPLE == 0:
+                        light_key = mix64(probe_key + uint64(texels * SCRAMBLES + scramble))
+                        rounds = _points_of(spans[p, half], j)
+                        into, spare = irradiance[p, block, scramble], lanes[SCRAMBLES_PER_HALF]
+                        _sample_lights(t, ray, ray_bits, (x0, y0, z0), texel, texels, rounds, light_rate, light_key, normals, spare, into)
     return _DONE
 
 
@@ -269,14 +306,14 @@ def capture_radiance(
     tracer: Tracer,
     positions: F64,
     ids: NDArray[np.uint64],
-    samples: tuple[int, int],
+    spans: I64,
     capture: Capture,
     *,
     threads: int,
     cancelled: NDArray[np.uint8],
     advance: Callable[[float], None],
 ) -> tuple[F64, F64, int]:
-    """Sums over a range of samples for some probes, on several threads.
+    """Sums over ranges of samples for some probes, on several threads.
 
     Parameters
     ----------
@@ -284,8 +321,8 @@ def capture_radiance(
         Metres, local frame.
     ids : (p,) uint64
         A probe's number in the bake: makes its samples its own, in whatever shard it is traced.
-    samples : (int, int)
-        Half-open range. Sample s belongs to scramble s % SCRAMBLES.
+    spans : (p, HALVES, 2) int64
+        Half-open range of samples of each probe's halves (:func:`bake_core.allocation.uniform`).
     cancelled : (1,) uint8
         Set it from any thread to stop within one texel.
     advance : callable
@@ -295,8 +332,8 @@ def capture_radiance(
     -------
     irradiance : (p, SCRAMBLES, irradiance_resolution², 3) float64
         Sums; over the samples of a scramble they give irradiance, no 1/π inside.
-    radiance : (p, resolution², 3) float64
-        Sums over all samples; (0, 0, 0) unless it is kept.
+    radiance : (p, HALVES, resolution², 3) float64
+        Sums; (0, 0, 0, 0) unless it is kept.
     rays : int
         Traced for them: through texels, on from surfaces, towards light.
 
@@ -307,24 +344,24 @@ def capture_radiance(
     normals, cosines = _irradiance_filter(capture.resolution, capture.irradiance_resolution)
     n = len(positions)
     irradiance = np.zeros((n, SCRAMBLES, normals.shape[1], 3))
-    radiance = np.zeros((n, capture.resolution**2, 3) if capture.keep_radiance else (0, 0, 0))
+    radiance = np.zeros((n, HALVES, capture.resolution**2, 3) if capture.keep_radiance else (0, 0, 0, 0))
 
     def trace(first: int, end: int, blocks: tuple[int, int]) -> tuple[F64, int]:
         ray = new_rayhit()
-        sums = np.zeros((end - first, BLOCKS, *irradiance.shape[1:]))
+        sums = np.zeros((end - first, BLOCKS, SCRAMBLES, 3, normals.shape[1]))
         status = _capture_kernel(
             tracer.tables,
             ray,
             positions[first:end],
             ids[first:end],
-            *samples,
+            spans[first:end],
             capture.resolution,
             blocks,
             normals,
             cosines,
             np.uint64(capture.seed),
             cancelled,
-            np.zeros((4, normals.shape[1]), np.float32),
+            (np.zeros((SCRAMBLES_PER_HALF + 1, 4, normals.shape[1]), np.float32), np.zeros((SCRAMBLES_PER_HALF, 4))),
             sums,
             radiance[first:end],
         )
@@ -351,7 +388,8 @@ def capture_radiance(
             rays = sum(counts)
         else:
             # Small enough that threads end together, large enough that Python's part is nothing.
-            step = max(1, min(n // (32 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(samples[1] - samples[0], 1))))
+            most = int((spans[..., 1] - spans[..., 0]).sum(1).max())
+            step = max(1, min(n // (32 * threads), _CHUNK_PATHS // (capture.resolution**2 * max(most, 1))))
             starts = range(0, n, step)
             rays = sum(pool.map(lambda first: trace_probes(first, min(first + step, n)), starts))
     return irradiance, radiance, rays
@@ -366,11 +404,11 @@ def _irradiance_filter(resolution: int, irradiance_resolution: int) -> tuple[F32
 
 
 def _sum_blocks(sums: F64) -> F64:
-    """In one fixed order."""
+    """In one fixed order; colours, which kernels keep apart, last."""
     total: F64 = sums[:, 0]
     for block in range(1, BLOCKS):
         total = total + sums[:, block]
-    return total
+    return np.moveaxis(total, -2, -1)
 
 
 def capture_distance(

@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bake_core.allocation import HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.spec import Stop
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 # Texels darker than this fraction of the mean count as if they were this bright: nobody sees 2 % of black.
 DARK_FRACTION = 0.05
@@ -26,8 +28,9 @@ DARK_FRACTION = 0.05
 _Z95 = 1.6448536269514722
 # The first pass; each later one doubles the samples.
 FIRST_SAMPLES = 16
-# A pass that a time limit shortens is a multiple of this: each scramble gets as many samples.
-SMALLEST_PASS = 4
+# A pass that is shortened is a multiple of this: each scramble gets as many samples.
+SMALLEST_PASS = SCRAMBLES
+_PROBES_AT_ONCE = 512
 
 Verdict = Literal["continue", "target", "samples", "time", "interrupt"]
 
@@ -54,9 +57,18 @@ class Point:
     error: float | None
 
 
-def next_pass(stop: Stop, samples: int) -> tuple[int, int]:
-    """The half-open range of samples of the pass after `samples` are done: 16, 32, 64, … up to the spec's maximum."""
-    return samples, min(max(FIRST_SAMPLES, 2 * samples), stop.max_samples)
+def next_pass(stop: Stop, samples: int, error: float | None = None) -> tuple[int, int]:
+    """The half-open range of samples of the pass after `samples` are done: 16, 32, 64, … up to the spec's maximum.
+
+    The last pass is no longer than the error so far says that it must be, in eighths of what is done: independent samples would need
+    (error / target)² as many, and scrambled ones need fewer.
+    """
+    end = max(FIRST_SAMPLES, 2 * samples)
+    if stop.target_error is not None and error is not None and samples >= PILOT_SAMPLES:
+        needed = samples * (error / stop.target_error) ** 2
+        step = max(samples // 8 // SMALLEST_PASS, 1) * SMALLEST_PASS
+        end = min(end, samples + max(math.ceil((needed - samples) / step), 1) * step)
+    return samples, min(end, stop.max_samples)
 
 
 def fit_pass(stop: Stop, samples: tuple[int, int], curve: Sequence[Point], seconds: float) -> tuple[int, int]:
@@ -95,56 +107,133 @@ def decide(stop: Stop, samples: int, error: float | None, seconds: float) -> Ver
     return "continue"
 
 
-def relative_error(sums: F64, samples: int, active: NDArray[np.bool_]) -> float | None:
-    """DESIGN's error figure from per-scramble sums.
+@dataclass(frozen=True)
+class Spread:
+    """What scrambles say of an estimate.
+
+    Attributes
+    ----------
+    square, variance : (p, m) float64
+        Of texels: the estimate's square and its variance, summed over colours.
+    degrees : int
+        Of freedom, of each variance.
+    """
+
+    square: F64
+    variance: F64
+    degrees: int
+
+    def relative(self, floor: float | None = None) -> F64:
+        """(p,) float64: each probe's mean of |ΔE|² / (E² + (0.05 Ē)²) over its texels; 0 where everything is black.
+
+        Parameters
+        ----------
+        floor : float, optional
+            (0.05 Ē)², where it is not that of these probes.
+        """
+        added = self.floor() if floor is None else floor
+        whole = self.square + added
+        share: F64 = np.divide(self.variance, whole, out=np.zeros_like(whole), where=whole > 0)
+        per_probe: F64 = share.mean(1)
+        return per_probe
+
+    def floor(self) -> float:
+        """(0.05 Ē)², Ē being the mean over all texels of |E|."""
+        return (DARK_FRACTION * float(np.sqrt(self.square).mean())) ** 2 if self.square.size else 0.0
+
+
+def spread(sums: NDArray[np.floating], drawn: I64, share: F64, half: int | None = None) -> Spread:
+    """The variance of an estimate from its scrambles, each half's about its own mean.
 
     Parameters
     ----------
-    sums : (p, r, m, 3) float64
-        Irradiance sums of r scrambles. With s samples, scramble i has had ⌈(s - i) / r⌉ of them.
-    samples : int
-        s.
-    active : (p,) bool
-        Probes that count.
+    sums : (p, SCRAMBLES, m, 3) float
+        One half's scrambles stand together.
+    drawn : (p, SCRAMBLES) int64
+        Samples of each scramble; none may be 0.
+    share : (p, SCRAMBLES) float64
+        Each scramble's share of the estimate.
+    half : int, optional
+        Only that half's word, as if it were the whole estimate.
+    """
+    chosen = range(HALVES) if half is None else range(half, half + 1)
+    p, _, m, _ = sums.shape
+    square, variance = np.empty((p, m)), np.empty((p, m))
+    # A few probes at a time: the sums of all of them are most of a bake's memory.
+    for first in range(0, p, _PROBES_AT_ONCE):
+        part = slice(first, first + _PROBES_AT_ONCE)
+        n = len(sums[part])
+        estimate, varied, whole = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, 1, 1))
+        for h in chosen:
+            own = slice(h * SCRAMBLES_PER_HALF, (h + 1) * SCRAMBLES_PER_HALF)
+            weight = share[part, own, None, None]
+            means = sums[part, own] / drawn[part, own, None, None].astype(np.float64)
+            total, mean = weight.sum(1), (weight * means).sum(1)
+            estimate += mean
+            whole += total
+            varied += ((means - (mean / total)[:, None]) ** 2 * weight**2).sum((1, 3))
+        square[part] = ((estimate / whole) ** 2).sum(-1)
+        variance[part] = varied / whole[..., 0] ** 2 * SCRAMBLES_PER_HALF / (SCRAMBLES_PER_HALF - 1)
+    return Spread(square, variance, len(chosen) * (SCRAMBLES_PER_HALF - 1))
+
+
+def relative_error(found: Spread) -> float:
+    """DESIGN's error figure.
 
     Returns
     -------
-    float or None
-        0.02 is 2 %. None with fewer than one sample in each scramble; 0 where everything is black.
+    float
+        0.02 is 2 %. 0 where there is nothing, or everything is black.
     """
-    r = sums.shape[1]
-    if samples < r:
-        return None
-    sums = sums[active]
-    if not sums.size:
-        return 0.0
-    drawn = np.array([-(-(samples - i) // r) for i in range(r)], np.float64)
-    means = sums / drawn[:, None, None]
-    estimate = sums.sum(1) / samples
-    # Variance of the pooled estimate: the scrambles' spread, each weighted by its share of the samples.
-    share = drawn / samples
-    spread = ((means - estimate[:, None]) ** 2 * share[:, None, None] ** 2).sum(1) * (r / (r - 1))
-    variance = spread.sum(-1)
-    square = (estimate**2).sum(-1)
-    floor = (DARK_FRACTION * float(np.sqrt(square).mean())) ** 2
-    if floor == 0:
-        return 0.0
-    per_probe = (variance / (square + floor)).mean(1)
-    mean = float(per_probe.mean())
+    per_probe = found.relative()
+    mean = float(per_probe.mean()) if per_probe.size else 0.0
     if mean == 0:
         return 0.0
     # How many probes' worth of errors there are: Satterthwaite 1946, and his sum of squares without its bias. A probe counts as one number,
     # because its texels share paths.
-    n = min(float(per_probe.sum()) ** 2 / float((per_probe**2).sum()) * (r + 1) / (r - 1), len(per_probe))
-    # The error itself scatters like χ² of n degrees of freedom, what is known of it like n (r - 1): their quotient is F-distributed.
-    return math.sqrt(mean * _f95(n, n * (r - 1)))
+    n = min(float(per_probe.sum()) ** 2 / float((per_probe**2).sum()) * (1 + 2 / found.degrees), len(per_probe))
+    # The error itself scatters like χ² of n degrees of freedom, what is known of it like n times those of each: their quotient is
+    # F-distributed.
+    return math.sqrt(mean * float(_f95(n, n * found.degrees)))
 
 
-def _f95(m: float, n: float) -> float:
+def interval(means: F64, share: F64) -> tuple[F64, F64]:
+    """Two-sided 95 % confidence intervals of numbers that each scramble has estimated.
+
+    Student's t, with the degrees of freedom that Welch 1947 and Satterthwaite 1946 give to a sum of two halves' variances.
+
+    Parameters
+    ----------
+    means : (p, SCRAMBLES, ...) float64
+        One half's scrambles stand together.
+    share : (p, SCRAMBLES) float64
+        Each scramble's share of the estimate.
+
+    Returns
+    -------
+    (p, ...) float64, (p, ...) float64
+        Middles, and half the widths.
+    """
+    weight = share.reshape(*share.shape, *[1] * (means.ndim - 2))
+    middle = (weight * means).sum(1)
+    variances = []
+    for half in range(HALVES):
+        own = slice(half * SCRAMBLES_PER_HALF, (half + 1) * SCRAMBLES_PER_HALF)
+        mean = (weight[:, own] * means[:, own]).sum(1, keepdims=True) / weight[:, own].sum(1, keepdims=True)
+        spread_out = ((means[:, own] - mean) ** 2 * weight[:, own] ** 2).sum(1)
+        variances.append(spread_out * SCRAMBLES_PER_HALF / (SCRAMBLES_PER_HALF - 1))
+    total = np.asarray(sum(variances))
+    squares = np.asarray(sum(v**2 for v in variances)) / (SCRAMBLES_PER_HALF - 1)
+    degrees = np.divide(total**2, squares, out=np.full_like(total, SCRAMBLES - HALVES), where=squares > 0)
+    # Student's t squared is F with one degree of freedom above.
+    return middle, np.sqrt(_f95(1.0, degrees) * total)
+
+
+def _f95(m: float, n: Any) -> Any:
     """The 95 % point of the F distribution with m ≥ 1 and n ≥ 3 degrees of freedom: Paulson 1942, Ann. Math. Stat. 13(2).
 
     4 % too large at (1, 3), within 0.2 % from (2, 6) on.
     """
     a, b = 2 / (9 * m), 2 / (9 * n)
     p, q = 1 - a, 1 - b
-    return ((p * q + _Z95 * math.sqrt(p * p * b + q * q * a - a * b * _Z95**2)) / (q * q - b * _Z95**2)) ** 3
+    return ((p * q + _Z95 * np.sqrt(p * p * b + q * q * a - a * b * _Z95**2)) / (q * q - b * _Z95**2)) ** 3

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.capture import SCRAMBLES, Capture, capture_radiance
+from bake_core.allocation import uniform
+from bake_core.capture import Capture, capture_radiance
 from bake_core.errors import SceneError
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
@@ -58,7 +59,7 @@ def check_light_ends(scene: Scene, tracer: Tracer, positions: F64, *, threads: i
                 replace(tracer, tables=tracer.tables._replace(max_bounces=np.int64(bounces))),
                 np.ascontiguousarray(positions[probes]),
                 probes.astype(np.uint64),
-                (0, paths // _TEXELS),
+                uniform(len(probes), (0, paths // _TEXELS)),
                 Capture(2, 2, seed=paths, keep_radiance=False),
                 threads=threads,
                 cancelled=cancelled,
@@ -82,7 +83,3 @@ def check_light_ends(scene: Scene, tracer: Tracer, positions: F64, *, threads: i
                 f"probe {int(worst[0])}",
             )
         first, count = first + count, min(2 * count, _MANY_PROBES)
-
-
-# Paths are dealt out over all scrambles alike.
-assert _PATHS % (_TEXELS * SCRAMBLES) == 0 and _CONFIRMING_PATHS % (_TEXELS * SCRAMBLES) == 0

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bake_core.allocation import Allocation
 from bake_core.bake import Prepared, check_finite, compile_kernels, empty_state, prepare, trace_shard
 from bake_core.environment import Find, no_images
 from bake_core.scene import Scene
@@ -93,8 +94,9 @@ def _paths_per_second(prepared: Prepared, threads: int) -> float:
     chosen = np.unique(np.linspace(0, n - 1, min(_PILOT_PROBES, n)).astype(int))
     compile_kernels(prepared)
     check_finite(prepared, threads=threads)
+    given = Allocation.start(n)
     started = time.perf_counter()
     for probe in chosen:
-        trace_shard(prepared, (int(probe), int(probe) + 1), (1, 1 + _PILOT_SAMPLES), threads=threads)
+        trace_shard(prepared, (int(probe), int(probe) + 1), (1, 1 + _PILOT_SAMPLES), given, threads=threads)
     paths = len(chosen) * prepared.selection.capture**2 * _PILOT_SAMPLES
     return paths / max(time.perf_counter() - started, 1e-9)

@@ -1,6 +1,6 @@
-"""Path-traced irradiance at receivers: the truth that a bundle's answers are held against.
+"""Path-traced irradiance about normals at points, on surfaces and in the open: the truth that a bundle's answers are held against.
 
-What arrives is measured as the query defines it: everything but the direct light of punctual and directional lights. Paths leave a receiver
+What arrives is measured as the query defines it: everything but the direct light of punctual and directional lights. Paths leave a point
 by the cosine, and one sample of the emitters and one of the sky go with each, weighted by the balance heuristic (Veach 1997): the same
 estimators as at any other vertex of a path, and no probe, texel or filter in between.
 """
@@ -21,7 +21,7 @@ from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel
 from bake_core.materials import INV_PI, lambert_cosine, no_gloss, sample_lambert
 from bake_core.next_event import from_emitters, from_sky
-from bake_core.receivers import Receivers, stand_on
+from bake_core.receivers import Receivers, stands_of
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.tracer import Tracer
 from bake_core.transport import trace_path
@@ -29,7 +29,7 @@ from bake_core.transport import trace_path
 F64 = NDArray[np.float64]
 
 _CANCELLED, _DONE = 1, 0
-# Receivers a thread takes at once: a fraction of a second's work.
+# Points a thread takes at once: a fraction of a second's work.
 _CHUNK = 32
 
 
@@ -55,7 +55,7 @@ def path_traced_irradiance(
     advance : callable, optional
         Told the fraction of the work that has been done since it was last called.
     cancelled : (1,) uint8, optional
-        Set it from any thread to stop within one receiver.
+        Set it from any thread to stop within one point.
 
     Returns
     -------
@@ -67,31 +67,56 @@ def path_traced_irradiance(
     ------
     Cancelled
     """
+    stands = stands_of(tracer, receivers.places)
+    return irradiance_at(
+        tracer, stands, samples=samples, scrambles=scrambles, seed=seed, threads=threads, advance=advance, cancelled=cancelled
+    )
+
+
+def irradiance_at(
+    tracer: Tracer,
+    stands: F64,
+    *,
+    samples: int,
+    scrambles: int,
+    seed: int,
+    threads: int = 1,
+    advance: Callable[[float], None] | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> F64:
+    """As :func:`path_traced_irradiance`, at any points.
+
+    Parameters
+    ----------
+    stands : (n, 10) float64
+        Local frame: point, geometric and shading normal, and how far to leave the surface (0 in the open, where both normals are one).
+    """
     flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
-    out = np.zeros((scrambles, len(receivers), 3))
+    n = len(stands)
+    out = np.zeros((scrambles, n, 3))
 
     def trace(first: int) -> int:
         part = slice(first, first + _CHUNK)
-        places = receivers.places.some(part)
-        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), places, first, samples, np.uint64(seed), flag, out[:, part])
+        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), stands[part], first, samples, np.uint64(seed), flag, out[:, part])
         return status
 
     with ThreadPoolExecutor(threads) as pool:
-        for status in pool.map(trace, range(0, len(receivers), _CHUNK)):
+        for status in pool.map(trace, range(0, n, _CHUNK)):
             if status == _CANCELLED:
                 raise Cancelled
             if advance is not None:
-                advance(_CHUNK / len(receivers))
+                advance(_CHUNK / n)
     return out
 
 
 @entry_kernel
-def _irradiance_kernel(t, ray, places, first, samples, seed, cancelled, out):  # type: ignore[no-untyped-def]
-    """Mean over paths and light samples from each receiver for each scramble; `first` is the number of the first receiver."""
+def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  # type: ignore[no-untyped-def]
+    """Mean over paths and light samples from each point for each scramble; `first` is the number of the first point."""
     ray_bits = ray.view(np.uint32)
     look = no_gloss(t)
     for i in range(out.shape[1]):
-        p, n, epsilon, _ = stand_on(t, ray, ray_bits, places, i)
+        s = stands[i]
+        p, n, epsilon = (s[0], s[1], s[2]), (s[3], s[4], s[5], s[6], s[7], s[8]), s[9]
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
         for scramble in range(out.shape[0]):
             if cancelled[0]:

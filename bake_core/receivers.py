@@ -194,6 +194,25 @@ def stand_on(t, ray, ray_bits, places, i):  # type: ignore[no-untyped-def]
     return p, n, epsilon, material
 
 
+@entry_kernel
+def _stand(t, ray, places, stands):  # type: ignore[no-untyped-def]
+    """Fill in what :func:`stand_on` says of places, (n, 10): point, geometric and shading normal, how far to leave the surface."""
+    ray_bits = ray.view(np.uint32)
+    for i in range(stands.shape[0]):
+        p, n, epsilon, _ = stand_on(t, ray, ray_bits, places, i)
+        for axis in range(3):
+            stands[i, axis], stands[i, 3 + axis], stands[i, 6 + axis] = p[axis], n[axis], n[3 + axis]
+        stands[i, 9] = epsilon
+    return 0
+
+
+def stands_of(tracer: Tracer, places: Places) -> F64:
+    """(n, 10) float64, local frame: point, geometric and shading normal, and how far to leave the surface."""
+    out = np.empty((len(places.items), 10))
+    _stand(tracer.tables, new_rayhit(), places, out)
+    return out
+
+
 @kernel
 def _sees_a_probe(t, ray, ray_bits, p, n, epsilon, probes):  # type: ignore[no-untyped-def]
     """Whether any active probe of the cell around a point, the nearest cell where it is outside, has a free view of it from the front."""

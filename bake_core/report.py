@@ -60,6 +60,7 @@ def write(folder: Path, manifest: dict[str, Any], digest: str, run: Run) -> None
         "machine": {"cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()},
         "error": manifest["error"],
         "samples": manifest["samples"],
+        "sampling": manifest["sampling"],
         **asdict(run),
         "rate": rate_json(run),
     }
@@ -88,7 +89,7 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
     facts = {
         "error": f"{percent(manifest['error']['value'])} (target {percent(manifest['error']['target'])})",
         "stopped by": manifest["stopped"],
-        "samples": manifest["samples"],
+        "samples": _samples(manifest),
         "probes": f"{probes}, {active} of them active",
         "seconds": f"{document['seconds']:.1f}",
         "scene": manifest["scene"]["digest"],
@@ -99,6 +100,11 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
     ]
     curve = [(p["samples"], f"{p['rays']:,}", f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
     fitted = [(f"against {name}", in_words(rate)) for name, rate in zip(("samples", "seconds of tracing"), run.rates(), strict=True)]
+    outputs = [(x["output"], _output_error(x["value"])) for x in manifest["error"]["outputs"]]
+    worst = [
+        (p["volume"], p["probe"], ", ".join(f"{x:.4g}" for x in p["position"]), percent(p["error"]))
+        for p in manifest["error"]["probes"]["worst"]
+    ]
     left_out = [(x["what"], x["why"]) for x in manifest["left_out"]]
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>octobake report</title>"
@@ -110,12 +116,29 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         + _table(("samples", "rays", "seconds", "error"), curve)
         + "<p>How fast the error falls: the slope of its logarithm, and its standard error. Independent samples have -0.5.</p>"
         + _table((), fitted)
+        + "<h2>Error by output and by probe</h2>"
+        + _table(("output", "95 % bound of the relative RMS"), outputs)
+        + f"<p>Standard error of a probe: median {percent(manifest['error']['probes']['median'])}, "
+        + f"95th percentile {percent(manifest['error']['probes']['p95'])}. The largest:</p>"
+        + _table(("volume", "probe", "position", "standard error"), worst)
         + "<h2>Atlases</h2>"
         + _table(("volume", "output", "stored as", "cost of storing", "file"), atlases)
         + "<h2>Left out</h2>"
         + (_table(("what", "why"), left_out) if left_out else "<p>Nothing.</p>")
         + "</html>\n"
     )
+
+
+def _samples(manifest: dict[str, Any]) -> str:
+    """How many, and what it saved to give easy probes fewer."""
+    mean, uniform = manifest["sampling"]["mean_samples"], manifest["sampling"]["uniform_samples"]
+    if mean >= manifest["samples"] or uniform is None:
+        return str(manifest["samples"])
+    return f"{manifest['samples']} at most, {mean:.0f} on average; the same error takes {uniform:.0f} if every probe gets as many"
+
+
+def _output_error(error: float | None) -> str:
+    return "not sampled: rays through texel centres" if error is None else percent(error)
 
 
 def _table(head: tuple[str, ...], rows: Any) -> str:

@@ -6,37 +6,24 @@ turn, probes apart), so the sums are the same bits however the work was split.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.convergence import relative_error
+from bake_core.allocation import HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF, Allocation, densities, of_half
+from bake_core.convergence import Spread, interval, relative_error, spread
+from bake_core.spec import Stop
+from bake_core.stored import Stored
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-
-
-class _Bytes:
-    """Dataclasses of arrays and integers as .npz bytes; the same bytes for the same values."""
-
-    def to_bytes(self) -> bytes:
-        out = io.BytesIO()
-        np.savez(out, allow_pickle=False, **{f.name: getattr(self, f.name) for f in fields(self)})  # type: ignore[arg-type]
-        return out.getvalue()
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Self:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            values = {f.name: stored[f.name] for f in fields(cls)}  # type: ignore[arg-type]
-        return cls(**{k: int(v) if v.ndim == 0 else v for k, v in values.items()})
+I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Tally(_Bytes):
+class Tally(Stored):
     """One shard's part of one pass.
 
     Attributes
@@ -45,10 +32,12 @@ class Tally(_Bytes):
         Half-open range of probes, numbered through the bake.
     first_sample, end_sample : int
         Half-open range of samples.
-    irradiance : (p, scrambles, m, 3) float64
+    taken : (p, HALVES) int64
+        Samples that each half has had at its end.
+    irradiance : (p, SCRAMBLES, m, 3) float32
         Sums.
-    radiance : (p, capture texels, 3) float64
-        Sums, or (0, 0, 0).
+    radiance : (p, HALVES, capture texels, 3) float32
+        Sums, or (0, 0, 0, 0).
     visibility : (p, v, v, 2) float32
         Moments; of the first pass only, else (0, 0, 0, 0). So are the next three.
     backface : (p,) float32
@@ -62,8 +51,9 @@ class Tally(_Bytes):
     end_probe: int
     first_sample: int
     end_sample: int
-    irradiance: F64
-    radiance: F64
+    taken: I64
+    irradiance: F32
+    radiance: F32
     visibility: F32
     backface: F32
     distance: F32
@@ -72,12 +62,22 @@ class Tally(_Bytes):
 
 
 @dataclass
-class State(_Bytes):
-    """Everything gathered so far, for all probes; arrays as in :class:`Tally`."""
+class State(Stored):
+    """Everything gathered so far, for all probes; arrays as in :class:`Tally`.
+
+    Attributes
+    ----------
+    samples : int
+        Of the probes that got most.
+    eighths : (n, HALVES) int64
+        How densely each probe's halves are sampled: :class:`bake_core.allocation.Allocation`.
+    """
 
     samples: int
-    irradiance: F64
-    radiance: F64
+    taken: I64
+    eighths: I64
+    irradiance: F32
+    radiance: F32
     visibility: F32
     backface: F32
     distance: F32
@@ -102,6 +102,7 @@ class State(_Bytes):
             raise ValueError(f"a pass from sample {first} does not follow {self.samples} samples")
         for t in ordered:
             probes = slice(t.first_probe, t.end_probe)
+            self.taken[probes] = t.taken
             self.irradiance[probes] += t.irradiance
             self.rays += t.rays
             if self.radiance.size:
@@ -117,21 +118,113 @@ class State(_Bytes):
         """(n,) bool: probes that stand outside geometry."""
         return self.backface < BACKFACE_LIMIT
 
-    def mean(self) -> F64:
-        """(n, m, 3) irradiance of every texel."""
-        mean: F64 = self.irradiance.sum(1) / self.samples
+    @property
+    def allocation(self) -> Allocation:
+        """What the next pass means for each probe."""
+        return Allocation(self.taken, self.eighths)
+
+    def allocate(self, stop: Stop) -> None:
+        """Decide, once the pilot is over, how densely to sample each probe: only where there is an error to reach."""
+        if stop.target_error is None or self.samples != PILOT_SAMPLES:
+            return
+        active = self.active()
+        rates = np.zeros((len(active), HALVES))
+        drawn = self._drawn()
+        for half in range(HALVES):
+            own = spread(self.irradiance[active], drawn[active], self._share()[active], half)
+            rates[active, half] = own.relative() * PILOT_SAMPLES / HALVES
+        self.eighths[active] = densities(rates[active], stop.target_error, stop.max_samples)
+        # Of what is inside a solid nothing is ever shown.
+        self.eighths[~active] = 1
+
+    def mean(self, probes: slice = slice(None)) -> F64:
+        """(p, m, 3) irradiance of every texel of some probes."""
+        weight = np.repeat(self._per_sample()[probes], SCRAMBLES_PER_HALF, 1)
+        mean: F64 = np.einsum("psmc,ps->pmc", self.irradiance[probes], weight)
+        return mean
+
+    def mean_radiance(self, probes: slice = slice(None)) -> F64:
+        """(p, capture texels, 3) radiance of every texel of some probes; only where it is kept."""
+        mean: F64 = np.einsum("phtc,ph->ptc", self.radiance[probes], self._per_sample()[probes])
         return mean
 
     def scramble_means(self) -> F64:
-        """(n, scrambles, m, 3) what each scramble alone says of it; NaN where it has had no sample."""
-        scrambles = self.irradiance.shape[1]
-        drawn = np.array([-(-(self.samples - i) // scrambles) for i in range(scrambles)], np.float64)
+        """(n, SCRAMBLES, m, 3) what each scramble alone says of irradiance; NaN where it has had no sample."""
         with np.errstate(invalid="ignore"):
-            return self.irradiance / drawn[:, None, None]
+            return self.irradiance / self._drawn()[..., None, None].astype(np.float64)
+
+    def spread(self) -> Spread | None:
+        """What the scrambles say of active probes' irradiance; None while not every scramble has had a sample."""
+        if self.samples < SCRAMBLES:
+            return None
+        active = self.active()
+        return spread(self.irradiance[active], self._drawn()[active], self._share()[active])
+
+    def mean_interval(self) -> tuple[F64, F64]:
+        """(n,) float64 twice: each probe's mean irradiance over texels and colours, and half of its 95 % confidence interval.
+
+        For as many samples as there are scrambles, or more.
+        """
+        return interval(self.scramble_means().mean((2, 3)), self._share())
+
+    def texel_interval(self) -> tuple[F64, F64]:
+        """(n, m, 3) float64 twice: as :meth:`mean_interval`, of each texel and colour."""
+        return interval(self.scramble_means(), self._share())
 
     def error(self) -> float | None:
         """DESIGN's error figure; None while it cannot be measured."""
-        return relative_error(self.irradiance, self.samples, self.active())
+        found = self.spread()
+        return None if found is None else relative_error(found)
+
+    def radiance_error(self) -> float | None:
+        """As :meth:`error`, of radiance texels: what two halves say of each; None where radiance is not kept or a half has no sample."""
+        if not self.radiance.size or self.samples < HALVES:
+            return None
+        active = self.active()
+        a, b = np.moveaxis(self.radiance[active] / self.taken[active][:, :, None, None].astype(np.float64), 1, 0)
+        return relative_error(Spread((((a + b) / 2) ** 2).sum(-1), (((a - b) / 2) ** 2).sum(-1), HALVES - 1))
+
+    def probe_errors(self) -> F64:
+        """(n,) float64: each probe's own relative RMS standard error; NaN for inactive ones, and while it cannot be measured."""
+        out = np.full(len(self.backface), np.nan)
+        found = self.spread()
+        if found is not None:
+            out[self.active()] = np.sqrt(found.relative())
+        return out
+
+    def mean_samples(self) -> float:
+        """Of a texel of an active probe."""
+        taken = self.taken[self.active()]
+        return float(taken.sum(1).mean()) if len(taken) else float(self.samples)
+
+    def uniform_samples(self) -> float | None:
+        """How many samples every texel would need for the same error, if all had as many; None while that cannot be measured.
+
+        Each probe's variance is taken to be inversely proportional to its samples, as that of independent ones is.
+        """
+        found = self.spread()
+        if found is None:
+            return None
+        variance, taken = found.relative(), self.taken[self.active()].sum(1)
+        whole = float(variance.sum())
+        return float((variance * taken).sum()) / whole if whole > 0 else self.mean_samples()
+
+    def _per_sample(self) -> F64:
+        """(n, HALVES) float64: what a sample weighs. Halves count alike whatever their numbers of samples: no value has a say in that."""
+        nominal = np.array([of_half(self.samples, half) for half in range(HALVES)]) / max(self.samples, 1)
+        weight: F64 = nominal / np.maximum(self.taken, 1)
+        return weight
+
+    def _drawn(self) -> I64:
+        """(n, SCRAMBLES) int64: samples of each scramble."""
+        scramble = np.arange(SCRAMBLES_PER_HALF)
+        drawn: I64 = (self.taken[:, :, None] - scramble + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF
+        return drawn.reshape(-1, SCRAMBLES)
+
+    def _share(self) -> F64:
+        """(n, SCRAMBLES) float64: of the estimate."""
+        share: F64 = np.repeat(self._per_sample(), SCRAMBLES_PER_HALF, 1) * self._drawn()
+        return share
 
 
 # A probe that sees back faces over more than a quarter of its sphere stands inside something, or behind it. RTXGI's default, which

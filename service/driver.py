@@ -162,7 +162,7 @@ class Driver:
                 break
             self._tracing = True
             try:
-                done = self._trace(work, following, probes, merged[-1].state if merged else None, clock)
+                done = self._trace(work, following, probes, merged[-1] if merged else None, clock)
             except _Enough:
                 run.stopped = "interrupt"
                 break
@@ -192,8 +192,8 @@ class Driver:
 
     def _open_pass(self, spec: Spec, merged: list[Pass], run: Run, probes: int) -> Pass | None:
         """The next pass, or None where the time that is left has no room for one."""
-        samples = merged[-1].last if merged else 0
-        first, last = fit_pass(spec.stop, next_pass(spec.stop, samples), run.curve, self._seconds())
+        samples, error = (merged[-1].last, merged[-1].error) if merged else (0, None)
+        first, last = fit_pass(spec.stop, next_pass(spec.stop, samples, error), run.curve, self._seconds())
         if first == last:
             return None
         paths = probes * (spec.resolution.radiance or 16) ** 2
@@ -204,8 +204,9 @@ class Driver:
         pieces = math.ceil(paths * (last - first) / rate / self._settings.shard_seconds)
         return self._store.begin_pass(self.job.id, len(merged), first, last, min(max(pieces, self._compute.slots), probes))
 
-    def _trace(self, work: worker.Work, opened: Pass, probes: int, state: str | None, clock: Clock) -> Pass:
+    def _trace(self, work: worker.Work, opened: Pass, probes: int, before: Pass | None, clock: Clock) -> Pass:
         """Trace what is missing of a pass, and merge it."""
+        state, allocation = (before.state, before.allocation) if before else (None, None)
         tallies = {i: s.tally for i, s in self._store.shards(self.job.id, opened.index).items()}
         ranges = bake.shard_ranges(probes, opened.shards)
 
@@ -215,16 +216,15 @@ class Driver:
                 self._store.commit_shard(self.job.id, opened.index, shard, tallies[shard], seconds)
 
             name = f"pass-{opened.index}-shard-{shard}"
-            return _Piece(worker.trace, (work, name, ranges[shard], (opened.first, opened.last)), commit)
+            return _Piece(worker.trace, (work, name, ranges[shard], (opened.first, opened.last), allocation), commit)
 
         clock.begin((opened.first, opened.last), opened.shards)
         for _ in tallies:
             clock.advance(1.0)
         self._run([piece(i) for i in range(opened.shards) if i not in tallies], clock.advance)
         references = [tallies[i] for i in range(opened.shards)]
-        state, error, rays = self._one(worker.merge, work, f"state-{opened.index}", state, references)
-        done = replace(opened, state=state, error=error, seconds=self._seconds(), rays=rays)
-        clock.measured(done.last, error)
+        done = replace(opened, **self._one(worker.merge, work, str(opened.index), state, references), seconds=self._seconds())
+        clock.measured(done.last, done.error)
         self._store.commit_pass(self.job.id, done, self._shown or {})
         self._hub.tell(self.job.id)
         return done

@@ -147,17 +147,19 @@ class Event:
 class Pass:
     """One doubling of a bake's samples: [first, last) of every probe, in `shards` pieces.
 
-    `state` names the merged sums in the job's work folder once every shard is in; until then it and the figures are None.
+    `state` names the merged sums in the job's work folder once every shard is in, `allocation` what they say of the next pass; until then
+    they and the figures are None.
     """
 
     index: int
     first: int
     last: int
     shards: int
-    state: str | None
-    error: float | None
-    seconds: float | None
-    rays: int | None
+    state: str | None = None
+    allocation: str | None = None
+    error: float | None = None
+    seconds: float | None = None
+    rays: int | None = None
 
     @property
     def point(self) -> Point:

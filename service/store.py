@@ -301,7 +301,7 @@ class Store:
         """Open a pass; its division into shards is fixed from here on, so that a restart can resume it."""
         with self._write() as c:
             c.execute(sa.insert(passes).values({"job": job, "index": index, "first": first, "last": last, "shards": pieces}))
-        return Pass(index, first, last, pieces, None, None, None, None)
+        return Pass(index, first, last, pieces)
 
     def commit_shard(self, job: str, pass_index: int, index: int, tally: str, seconds: float) -> None:
         """Record a shard's sums, once: whoever comes second is dropped, for its bytes are the same."""
@@ -315,7 +315,8 @@ class Store:
         """Record a pass that is merged, its point on the error curve and the job's progress."""
         with self._write() as c:
             key = (passes.c.job == job) & (passes.c.index == done.index)
-            c.execute(sa.update(passes).where(key).values(state=done.state, error=done.error, seconds=done.seconds, rays=done.rays))
+            known = {name: getattr(done, name) for name in ("state", "allocation", "error", "seconds", "rays")}
+            c.execute(sa.update(passes).where(key).values(known))
             c.execute(sa.update(jobs).where(jobs.c.id == job).values(progress=dict(progress)))
             _add_event(c, job, "pass", {"samples": done.last, "rays": done.rays, "seconds": done.seconds, "error": done.error})
 

@@ -87,6 +87,7 @@ passes = sa.Table(
     sa.Column("last", sa.Integer, nullable=False),
     sa.Column("shards", sa.Integer, nullable=False),
     sa.Column("state", sa.Text),
+    sa.Column("allocation", sa.Text),
     sa.Column("error", sa.Double),
     sa.Column("seconds", sa.Double),
     # Of all passes up to this one.

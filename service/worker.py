@@ -25,6 +25,7 @@ from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
 from bake_core import bake, plan, verification
+from bake_core.allocation import Allocation
 from bake_core.bundle import read_bundle
 from bake_core.cameras import parse_cameras
 from bake_core.errors import BakeError
@@ -107,24 +108,38 @@ def compile_kernels(work: Work) -> None:
         bake.check_finite(prepared, threads=work.own_threads, cancelled=task.flag)
 
 
-def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int]) -> tuple[str, float]:
+def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int], allocation: str | None) -> tuple[str, float]:
     """One shard of one pass; answers where its sums are stored and the seconds it took."""
     with _task(work) as task:
         prepared = _prepared(work)
+        blobs = _blobs(work.store)
+        given = Allocation.from_bytes(blobs.get_work(work.job, allocation)) if allocation else Allocation.start(prepared.probe_count)
         began = time.monotonic()
-        tally = bake.trace_shard(prepared, probes, samples, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
+        tally = bake.trace_shard(prepared, probes, samples, given, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
         seconds = time.monotonic() - began
-        return _blobs(work.store).put_work(work.job, name, tally.to_bytes()), seconds
+        return blobs.put_work(work.job, name, tally.to_bytes()), seconds
 
 
-def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> tuple[str, float | None, int]:
-    """Add a whole pass to the sums before it; answers where the new ones are stored, their error, and how many rays there were in all."""
+def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> dict[str, Any]:
+    """Add a whole pass to the sums before it.
+
+    Returns
+    -------
+    dict
+        Where the new sums are stored, and what the next pass is to know of them; their error, and how many rays there were in all.
+    """
     with _task(work), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         sums = _state(work, state)
         sums.add([Tally.from_bytes(blobs.get_work(work.job, tally)) for tally in tallies])
+        sums.allocate(parse_spec(work.spec).stop)
         blobs.put_work(work.job, PREVIEW, _preview(sums, folder).read_bytes())
-        return blobs.put_work(work.job, name, sums.to_bytes()), sums.error(), sums.rays
+        return {
+            "state": blobs.put_work(work.job, f"state-{name}", sums.to_bytes()),
+            "allocation": blobs.put_work(work.job, f"allocation-{name}", sums.allocation.to_bytes()),
+            "error": sums.error(),
+            "rays": sums.rays,
+        }
 
 
 def finish(work: Work, state: str, run: Run) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bake_core.allocation import uniform
 from bake_core.bake import prepare
 from bake_core.capture import Capture, capture_radiance
 from bake_core.gltf.reader import load_scene
@@ -68,13 +69,13 @@ def bake(peers: Path, folder: Path, name: str, samples: int, chosen: NDArray[np.
             prepared.tracer,
             np.ascontiguousarray(prepared.positions[chosen]),
             chosen.astype(np.uint64),
-            (0, samples),
+            uniform(len(chosen), (0, samples)),
             Capture(16, 8, seed, True),
             threads=THREADS,
             cancelled=flag,
             advance=lambda _: None,
         )
-        out[seed] = radiance.reshape(out.shape[1:]) / samples
+        out[seed] = radiance.sum(1).reshape(out.shape[1:]) / samples
     return out
 
 

@@ -90,7 +90,7 @@ def test_a_bake_in_steps_through_bytes_is_the_same_bake(tmp_path: Path) -> None:
         state = State.from_bytes(stored)
         run = next_pass(prepared.spec.stop, samples)
         elsewhere = prepare(load_scene(tmp_path / "scene.glb"), parse_spec(spec))  # another worker
-        tallies = [trace_shard(elsewhere, r, run, threads=1).to_bytes() for r in reversed(shard_ranges(27, 4))]
+        tallies = [trace_shard(elsewhere, r, run, state.allocation, threads=1).to_bytes() for r in reversed(shard_ranges(27, 4))]
         state.add([Tally.from_bytes(t) for t in tallies])
         stored, samples = state.to_bytes(), state.samples
     finish(prepared, State.from_bytes(stored), Run(threads=1, shards=4, stopped="samples"), tmp_path / "steps")
@@ -156,7 +156,7 @@ def test_the_curve_has_a_point_for_each_doubling_and_errors_fall(tmp_path: Path)
     assert all(a.seconds < b.seconds for a, b in pairwise(result.run.curve))
     errors = [p.error for p in result.run.curve]
     assert errors[0] > 2 * errors[-1] > 0  # type: ignore[operator]
-    assert result.manifest["error"] == {"value": errors[-1], "target": None, "scrambles": 4}
+    assert result.manifest["error"] == {"value": errors[-1], "target": None, "scrambles": 16}
     report = read_report(tmp_path / "out")
     assert report is not None
     assert report["curve"] == [asdict(p) for p in result.run.curve]

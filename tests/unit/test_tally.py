@@ -9,23 +9,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bake_core.allocation import FULL, HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.tally import BACKFACE_LIMIT, State, Tally
 
 Array = NDArray[Any]
-PROBES, SCRAMBLES, TEXELS = 6, 4, 9
+NOTHING = np.zeros((0, 0, 0, 0), np.float32)
+PROBES, TEXELS = 6, 9
 
 
 def tally(probes: tuple[int, int], samples: tuple[int, int], *, seed: int = 0, radiance: bool = True) -> Tally:
     """A shard's part of a pass: numbers that depend on the probe, not on the shard."""
     n = probes[1] - probes[0]
     random = np.random.default_rng(seed)
-    whole = random.random((PROBES, SCRAMBLES, TEXELS, 3))[slice(*probes)]
+    whole = random.random((PROBES, SCRAMBLES, TEXELS, 3), np.float32)[slice(*probes)]
     first = samples[0] == 0
     return Tally(
         *probes,
         *samples,
+        taken=np.full((n, HALVES), samples[1] // HALVES),
         irradiance=whole,
-        radiance=random.random((PROBES, 16, 3))[slice(*probes)] if radiance else np.zeros((0, 0, 0)),
+        radiance=random.random((PROBES, HALVES, 16, 3), np.float32)[slice(*probes)] if radiance else NOTHING,
         visibility=random.random((PROBES, 2, 2, 2))[slice(*probes)].astype(np.float32) if first else np.zeros((0, 0, 0, 0), np.float32),
         backface=np.linspace(0, 0.5, PROBES, dtype=np.float32)[slice(*probes)] if first else np.zeros(0, np.float32),
         distance=np.full((n, 4), 2.0, np.float32) if first else np.zeros((0, 0), np.float32),
@@ -37,8 +40,10 @@ def tally(probes: tuple[int, int], samples: tuple[int, int], *, seed: int = 0, r
 def empty() -> State:
     return State(
         samples=0,
-        irradiance=np.zeros((PROBES, SCRAMBLES, TEXELS, 3)),
-        radiance=np.zeros((PROBES, 16, 3)),
+        taken=np.zeros((PROBES, HALVES), np.int64),
+        eighths=np.full((PROBES, HALVES), FULL),
+        irradiance=np.zeros((PROBES, SCRAMBLES, TEXELS, 3), np.float32),
+        radiance=np.zeros((PROBES, HALVES, 16, 3), np.float32),
         visibility=np.zeros((PROBES, 2, 2, 2), np.float32),
         backface=np.zeros(PROBES, np.float32),
         distance=np.zeros((PROBES, 4), np.float32),
@@ -107,8 +112,39 @@ def test_what_a_pass_adds() -> None:
         np.testing.assert_array_equal(getattr(state, name), getattr(first, name))
 
 
+@pytest.mark.parametrize("samples", [1, 2, 15])
+def test_with_fewer_samples_than_scrambles_there_is_no_error(samples: int) -> None:
+    state = empty()
+    state.add([tally((0, PROBES), (0, samples))])
+    assert state.error() is None
+
+
+def test_inactive_probes_do_not_count() -> None:
+    state = empty()
+    state.add([tally((0, PROBES), (0, 16))])
+    before = state.error()
+    assert before is not None and before > 0
+    inactive = ~state.active()
+    assert 0 < inactive.sum() < PROBES
+    state.irradiance[inactive] *= np.random.default_rng(3).random((inactive.sum(), SCRAMBLES, TEXELS, 3)).astype(np.float32) * 100
+    assert state.error() == before
+
+
+def test_halves_count_alike_whatever_their_numbers_of_samples() -> None:
+    """One half had 16 samples of 1, the other 8 of 4: no number of samples may have a say in the mean."""
+    state = replace(empty(), samples=32, taken=np.tile([[16, 8]], (PROBES, 1)))
+    state.irradiance[:, :SCRAMBLES_PER_HALF] = 2 * 1.0
+    state.irradiance[:, SCRAMBLES_PER_HALF:] = 1 * 4.0
+    state.radiance[:, 0], state.radiance[:, 1] = 16 * 1.0, 8 * 4.0
+    np.testing.assert_array_equal(state.mean(), 2.5)
+    np.testing.assert_array_equal(state.mean(slice(1, 3)), np.full((2, TEXELS, 3), 2.5))
+    np.testing.assert_array_equal(state.mean_radiance(), 2.5)
+    np.testing.assert_array_equal(state.scramble_means().mean(1), state.mean())
+    assert state.error() == 0  # each half agrees with itself
+
+
 def test_what_is_not_kept_is_not_added() -> None:
-    state = replace(empty(), radiance=np.zeros((0, 0, 0)), distance=np.zeros((0, 0), np.float32))
+    state = replace(empty(), radiance=NOTHING, distance=np.zeros((0, 0), np.float32))
     state.add([tally((0, PROBES), (0, 16), radiance=False)])
     assert not state.radiance.size and not state.distance.size
 

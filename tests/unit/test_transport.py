@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bake_core.allocation import Allocation
 from bake_core.bake import Prepared, prepare, trace_shard
 from bake_core.examples import closed_box, two_rooms
 from bake_core.gltf.writer import GlbWriter, Part, look_at
@@ -32,7 +33,7 @@ def prepared(scene: Scene | GlbWriter, spec: dict[str, Any]) -> Prepared:
 
 def irradiance(p: Prepared, samples: int) -> Array:
     """Every texel of every probe, (n, m, 3)."""
-    tally = trace_shard(p, (0, p.probe_count), (0, samples), threads=1)
+    tally = trace_shard(p, (0, p.probe_count), (0, samples), Allocation.start(p.probe_count), threads=1)
     return np.asarray(tally.irradiance.sum(1) / samples)
 
 
@@ -283,7 +284,7 @@ def test_camera_rays_pass_through_backs_of_single_sided_surfaces() -> None:
     add_square(w, "grey", (0.5,) * 3, matrix=np.diag([1e4, 1, 1e4, 1]))
     volume = {"origin": [0, -0.2, 0], "spacing": [1, 1, 1], "counts": [1, 1, 1]}
     p = prepared(w, {"volumes": [volume], "environment": sky()})
-    tally = trace_shard(p, (0, 1), (0, 16), threads=1)
+    tally = trace_shard(p, (0, 1), (0, 16), Allocation.start(1), threads=1)
     assert tally.backface[0] == pytest.approx(0.5, abs=0.01)
     e = tally.irradiance.sum((1, 3))[0] / 16 / 3
     assert e.max() == pytest.approx(math.pi, rel=0.05) and e.min() < 0.05 * math.pi
