@@ -57,8 +57,9 @@ class Allocation(Stored):
     taken : (n, HALVES) int64
         Samples of each half so far.
     eighths : (n, HALVES) int64
-        Out of FULL. A power of two, so that a probe has had one of the numbers of points at which a Sobol' sequence is a net, whenever the
-        hardest probe has; until its share is more than the pilot was, it is left out of passes.
+        Out of FULL; 0 for a probe inside a solid, which is not traced. Else a power of two, so that a probe has had one of the numbers of
+        points at which a Sobol' sequence is a net, whenever the hardest probe has; until its share is more than the pilot was, it is left
+        out of passes.
     """
 
     taken: I64

@@ -20,7 +20,7 @@ from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.images import write_exr
 from bake_core.placement import Volume
 from bake_core.scene import Scene
-from bake_core.selection import Selection
+from bake_core.selection import LeftOut, Selection
 from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.shader_files import shader_dir
 from bake_core.spec import OutputName, Spec
@@ -41,14 +41,27 @@ PARAMETERS = {
 # flat-wall variances come out negative). Distances are metres of any scale.
 _ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
 
+_BYTES = {"half": 2, "float": 4}
 # As many as anybody would go and look at.
 _WORST_PROBES = 8
 
 
 def assemble(
-    scene: Scene, spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State, stopped: Verdict, folder: Path
+    scene: Scene,
+    spec: Spec,
+    volumes: tuple[Volume, ...],
+    selection: Selection,
+    left_out: tuple[LeftOut, ...],
+    state: State,
+    stopped: Verdict,
+    folder: Path,
 ) -> dict[str, Any]:
     """Write atlases and shaders into a folder.
+
+    Parameters
+    ----------
+    left_out : tuple of LeftOut
+        Outputs and all else.
 
     Returns
     -------
@@ -61,13 +74,15 @@ def assemble(
         ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
     """
     active = state.active()
-    entries, data = [], []
+    entries, data, saved = [], [], 0
     first = 0
     for volume in volumes:
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection, state, active, probes, folder)
+        entry, content = _volume(volume, selection, state, active, probes, folder, whole=spec.outputs != "auto")
         entries.append(entry)
         data.append(content)
+        inside = volume.probe_count - entry["probes"]["active"]
+        saved += inside * sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
@@ -86,11 +101,36 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [{"what": what, "why": why} for what, why in selection.left_out],
+        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved) + _left_out_channels(entries, data),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
     }
+
+
+def _left_out_probes(active: NDArray[np.bool_], saved: int) -> list[dict[str, Any]]:
+    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression."""
+    inside = len(active) - int(active.sum())
+    if not inside:
+        return []
+    why = "inside solids: more than a quarter of what they see are backs of single-sided surfaces"
+    return [{"what": f"{inside} of {len(active)} probes", "why": why, "bytes": saved}]
+
+
+def _left_out_channels(entries: list[dict[str, Any]], data: list[VolumeData]) -> list[dict[str, Any]]:
+    """What the manifest says of maps that take less room than their texels."""
+    out = []
+    for entry, volume in zip(entries, data, strict=True):
+        for described in entry["atlases"]:
+            atlas, names = volume.atlases[described["output"]], described["channels"]
+            size = atlas.texels[..., 0].size * _BYTES[atlas.encoding]
+            what = f"{volume.name}: {atlas.output}"
+            if "constant" in described:
+                out.append({"what": f"{what} map", "why": "every texel is the same", "bytes": size * len(names)})
+            elif len(set(names)) < len(names):
+                why = "nothing in it has a hue: one channel holds all three"
+                out.append({"what": f"{what} in colour", "why": why, "bytes": size * (len(names) - 1)})
+    return out
 
 
 def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state: State) -> dict[str, Any]:
@@ -122,17 +162,18 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 
 def _volume(
-    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path
+    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path, *, whole: bool
 ) -> tuple[dict[str, Any], VolumeData]:
-    """One volume's files, its entry in the manifest, and what its shaders need to know."""
-    maps = {output: _interior(output, selection, state, probes) for output in selection.outputs}
+    """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
+    kept = np.flatnonzero(active[probes])
+    maps = {output: _interior(output, selection, state, probes)[kept] for output in selection.outputs}
     tiles = [m.shape[1] + 2 for m in maps.values()]
-    shape = layout(volume.counts, max(tiles))
+    shape = layout(volume.counts, max(tiles), len(kept))
     atlases: dict[str, Atlas] = {}
     described = []
     for output, interior in maps.items():
         if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
-            bad = int(np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0])
+            bad = int(kept[np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0]])
             raise BakeError(
                 "bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}"
             )
@@ -140,17 +181,22 @@ def _volume(
         atlas = Atlas(
             output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding
         )
-        file = f"{volume.name}.{output}.exr"
-        _write_layers(folder / file, atlas.texels, output, half=encoding == "half")
         entry: dict[str, Any] = {
             "output": output,
-            "file": file,
+            "file": f"{volume.name}.{output}.exr",
             "encoding": encoding,
             "encoding_error": cost,
             "channels": list(CHANNELS[output]),
             "tile": atlas.tile,
             "interior": atlas.interior,
         }
+        if not whole and len(kept) and (interior == interior[0, 0, 0]).all():
+            stored = interior[0, 0, 0].astype(np.float16 if encoding == "half" else np.float32)
+            entry |= {"file": None, "constant": [float(str(x)) for x in stored]}
+        elif not whole and entry["channels"] == ["R", "G", "B"] and (interior == interior[..., :1]).all():
+            entry["channels"] = ["Y"] * 3
+        if entry["file"] is not None:
+            _write_layers(folder / entry["file"], atlas.texels, tuple(dict.fromkeys(entry["channels"])), half=encoding == "half")
         if output == "distance":
             entry["miss"] = selection.miss_distance
         atlases[output] = atlas
@@ -169,7 +215,7 @@ def _volume(
     )
     table = probe_texels(content)
     probe_file = f"{volume.name}.probes.exr"
-    _write_layers(folder / probe_file, table, "probes", half=False)
+    _write_layers(folder / probe_file, table, CHANNELS["probes"], half=False)
     entry = {
         "name": volume.name,
         "origin": volume.origin.tolist(),
@@ -181,7 +227,7 @@ def _volume(
         "probes": {
             "file": probe_file,
             "count": volume.probe_count,
-            "active": int(active[probes].sum()),
+            "active": len(kept),
             "states": active[probes].astype(int).tolist(),
             "offsets": None,
             # Shortest decimals of the float32 values.
@@ -210,7 +256,7 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
         return np.asarray(state.mean_radiance(probes), np.float32).reshape(-1, selection.capture, selection.capture, 3)
 
 
-def _write_layers(path: Path, texels: F32, output: str, *, half: bool) -> None:
-    """Layers stacked downwards in one image, so that one read gives a 2D array's texels in order."""
-    layers, height, width, channels = texels.shape
-    write_exr(path, texels.reshape(layers * height, width, channels), CHANNELS[output], half=half)
+def _write_layers(path: Path, texels: F32, channels: tuple[str, ...], *, half: bool) -> None:
+    """Layers stacked downwards in one image, so that one read gives a 2D array's texels in order; of alike channels the first ones."""
+    layers, height, width, _ = texels.shape
+    write_exr(path, np.ascontiguousarray(texels.reshape(layers * height, width, -1)[..., : len(channels)]), channels, half=half)

@@ -1,4 +1,4 @@
-"""Atlases: a tile a probe, packed into layers, stored as EXR in half or full floats."""
+"""Atlases: a tile for each probe that is kept, packed into layers, stored as EXR in half or full floats."""
 
 from __future__ import annotations
 
@@ -25,15 +25,18 @@ HALF_TOLERANCE = 2.5e-4
 
 @dataclass(frozen=True)
 class Layout:
-    """Probe p is the tile at layer p // (columns * rows), row p % (columns * rows) // columns, column p % columns."""
+    """Tile t lies in layer t // (columns * rows), row t % (columns * rows) // columns, column t % columns."""
 
     columns: int
     rows: int
     layers: int
 
 
-def layout(counts: tuple[int, int, int], tile: int) -> Layout:
+def layout(counts: tuple[int, int, int], tile: int, kept: int | None = None) -> Layout:
     """How a volume's tiles are packed: columns along x, rows along y and a layer per z where that fits, else as square as it goes.
+
+    Where some probes are left out, layers have as many rows as waste the fewest places. The probe table, which holds all of them, has
+    the same columns and rows, and more layers.
 
     Parameters
     ----------
@@ -41,15 +44,27 @@ def layout(counts: tuple[int, int, int], tile: int) -> Layout:
         Probes along each axis.
     tile : int
         Texels along the side of the largest of the volume's tiles, border included: all of its atlases share one layout.
+    kept : int, optional
+        Tiles; all probes have one where it is left out. At least one place is made.
     """
     nx, ny, nz = counts
     most = MAX_SIDE // tile
-    if nx <= most and ny <= most and nz <= MAX_LAYERS:
-        return Layout(nx, ny, nz)
     probes = nx * ny * nz
-    columns = min(probes, most)
-    rows = min(-(-probes // columns), most)
-    return Layout(columns, rows, -(-probes // (columns * rows)))
+    if nx <= most and ny <= most and nz <= MAX_LAYERS:
+        columns, rows = nx, ny
+    else:
+        columns = min(probes, most)
+        rows = min(-(-probes // columns), most)
+    tiles = probes if kept is None else max(kept, 1)
+    if tiles < probes:
+        few = -(-probes // (columns * MAX_LAYERS))
+        rows = min(range(rows, min(few, rows) - 1, -1), key=lambda r: layers_of(tiles, columns, r) * r)
+    return Layout(columns, rows, layers_of(tiles, columns, rows))
+
+
+def layers_of(tiles: int, columns: int, rows: int) -> int:
+    """How many layers of columns × rows places hold some tiles."""
+    return -(-tiles // (columns * rows))
 
 
 def pack(interior: F32, shape: Layout) -> F32:
@@ -60,12 +75,12 @@ def pack(interior: F32, shape: Layout) -> F32:
     Parameters
     ----------
     interior : (n, t, t, channels) float32
-        Every probe's map, in flat order; n may be less than the layout holds.
+        The map of every probe that is kept, in flat order; n may be less than the layout holds.
 
     Returns
     -------
     (layers, rows * (t + 2), columns * (t + 2), channels) float32
-        Places without a probe are 0.
+        Places without a tile are 0.
     """
     tiles = with_border(interior)
     n, side, _, channels = tiles.shape
@@ -77,7 +92,7 @@ def pack(interior: F32, shape: Layout) -> F32:
 
 
 def unpack(texels: F32, shape: Layout, n: int) -> F32:
-    """Every probe's map without its border, (n, t, t, channels). Inverse of :func:`pack`."""
+    """Every tile's map without its border, (n, t, t, channels). Inverse of :func:`pack`."""
     layers, height, _, channels = texels.shape
     side = height // shape.rows
     grid = texels.reshape(layers, shape.rows, side, shape.columns, side, channels).transpose(0, 1, 3, 2, 4, 5)

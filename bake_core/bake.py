@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
 from bake_core.assemble import assemble
+from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
 from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, decide, fit_pass, next_pass
@@ -38,10 +39,11 @@ from bake_core.progress import ProgressCallback
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
-from bake_core.selection import Selection, select
+from bake_core.selection import LeftOut, Selection, select
 from bake_core.spec import Spec
-from bake_core.tally import State, Tally
+from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
+from bake_core.unneeded import unneeded
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64
@@ -71,6 +73,11 @@ class Prepared:
     def probe_count(self) -> int:
         return len(self.positions)
 
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Outputs first, then what kernels do without."""
+        return self.selection.left_out + unneeded(self.tracer.tables)
+
 
 def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     """Place the probes, choose the outputs, build the acceleration structure.
@@ -87,11 +94,12 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     volumes = place(scene, spec)
     environment, named = read_environment(spec.environment, find)
     spec = spec.model_copy(update={"environment": named})
+    probes = sum(v.probe_count for v in volumes)
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
-        selection=select(scene, spec),
+        selection=select(scene, spec, probes),
         tracer=Tracer.build(scene, spec, environment),
         positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
@@ -149,7 +157,7 @@ def trace_shard(
     Parameters
     ----------
     probes, samples : (int, int)
-        Half-open ranges. The pass that starts at sample 0 also captures distances.
+        Half-open ranges. The pass that starts at sample 0 captures distances first: who stands inside a solid is not traced.
     allocation : Allocation
         What each probe of the bake has had before this pass, and what part of it each gets.
     cancelled : (1,) uint8, optional
@@ -167,11 +175,26 @@ def trace_shard(
     ids = np.arange(*probes, dtype=np.uint64)
     capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
     spans = allocation.spans(samples, slice(*probes))
+    seen: dict[str, NDArray[np.float32]] = {}
+    looked = 0
+    if samples[0] == 0:
+        seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag)
+        kept = outside(seen["backface"])
+        seen = {name: values if name == "backface" else values[kept] for name, values in seen.items()}
+        spans[~kept, :, 1] = spans[~kept, :, 0]
+    else:
+        kept = allocation.eighths[slice(*probes)].max(1) > 0
     irradiance, radiance, rays = capture_radiance(
-        prepared.tracer, positions, ids, spans, capture, threads=threads, cancelled=flag, advance=advance
+        prepared.tracer,
+        np.ascontiguousarray(positions[kept]),
+        ids[kept],
+        np.ascontiguousarray(spans[kept]),
+        capture,
+        threads=threads,
+        cancelled=flag,
+        advance=advance,
     )
     empty = np.zeros
-    seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag) if samples[0] == 0 else ({}, 0)
     return Tally(
         *probes,
         *samples,
@@ -192,9 +215,11 @@ def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
         return sums.astype(np.float32)
 
 
-def compile_kernels(prepared: Prepared) -> None:
-    """Compile, or fetch from the cache on disk, every kernel that a bake runs: by tracing no probe at all."""
+def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
+    """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
+    if audited:
+        compile_audit(prepared.scene, prepared.tracer)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -292,8 +317,25 @@ def gather(
     return state
 
 
-def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, Any]:
-    """Write the bundle: atlases, shaders, manifest, report; all or nothing.
+def finish(
+    prepared: Prepared,
+    state: State,
+    run: Run,
+    out: Path,
+    *,
+    audit_seconds: float | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> dict[str, Any]:
+    """Write the bundle: atlases, shaders, manifest, an audit of them, report; all or nothing.
+
+    Parameters
+    ----------
+    run : Run
+        Its audit is filled in.
+    audit_seconds : float, optional
+        What the audit may take; 3 % of the bake where left out. 0: no audit.
+    cancelled : (1,) uint8, optional
+        Set it to 1 from any thread: the audit ends, and the report has none.
 
     Returns
     -------
@@ -310,14 +352,29 @@ def finish(prepared: Prepared, state: State, run: Run, out: Path) -> dict[str, A
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
             work = Path(folder) / "bundle"
             work.mkdir()
-            manifest = assemble(prepared.scene, prepared.spec, prepared.volumes, prepared.selection, state, run.stopped, work)
+            manifest = assemble(
+                prepared.scene, prepared.spec, prepared.volumes, prepared.selection, prepared.left_out, state, run.stopped, work
+            )
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)
+            allowed = DEFAULT_SHARE * run.seconds if audit_seconds is None else audit_seconds
+            if audit_seconds != 0:
+                run.audit = _audit(prepared, state, work, allowed, run.threads, cancelled)
             report.write(work, manifest, bundle.content_digest(written), run)
             bundle.publish(work, out)
     except OSError as e:
         raise MachineError("machine.cannot_write", f"{e.strerror or e}; is there room on the disk?", str(out)) from e
     return manifest
+
+
+def _audit(prepared: Prepared, state: State, work: Path, seconds: float, threads: int, cancelled: NDArray[np.uint8] | None) -> Audit | None:
+    """Of what has just been written; None where somebody has no more time for it."""
+    volumes = bundle.read_bundle(work).volumes
+    baked = Baked(prepared.scene, prepared.spec, prepared.tracer, state, volumes, prepared.positions, prepared.limits)
+    try:
+        return audit(baked, seconds, threads=threads, cancelled=cancelled)
+    except Cancelled:
+        return None
 
 
 @dataclass(frozen=True)
@@ -338,6 +395,7 @@ def bake(
     shards: int = 1,
     find: Find = no_images,
     adaptive: bool = True,
+    audit_seconds: float | None = None,
     progress: ProgressCallback | None = None,
     point: Callable[[Point], None] = lambda point: None,
     cancelled: NDArray[np.uint8] | None = None,
@@ -356,6 +414,8 @@ def bake(
         Where an image that the spec names lies.
     adaptive : bool
         Whether easy probes may get fewer samples, where there is an error to reach (:mod:`bake_core.allocation`).
+    audit_seconds : float, optional
+        As :func:`finish` has it.
     point : callable, optional
         Told each point of the curve of error against time as it is measured.
     cancelled : (1,) uint8, optional
@@ -376,14 +436,14 @@ def bake(
     clock.stage("building")
     prepared = prepare(scene, spec, find)
     clock.stage("compiling")
-    compile_kernels(prepared)
+    compile_kernels(prepared, audited=audit_seconds != 0)
     clock.stage("tracing")
     check_finite(prepared, threads=threads, cancelled=cancelled)
     run = Run(threads, shards, began=clock.elapsed)
     state = gather(prepared, run, clock, adaptive=adaptive, point=point, cancelled=cancelled)
     clock.stage("writing")
     run.seconds, run.stages = clock.elapsed, clock.stages()
-    manifest = finish(prepared, state, run, out)
+    manifest = finish(prepared, state, run, out, audit_seconds=audit_seconds, cancelled=cancelled)
     return BakeResult(manifest, run, met(spec, run))
 
 

@@ -27,9 +27,9 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Atlas:
-    """One output of one volume: a tile a probe, packed in layers.
+    """One output of one volume: a tile for each probe that is kept, packed in layers.
 
-    Probe p is the tile at layer ``p // (columns * rows)``, row ``p % (columns * rows) // columns``, column ``p % columns``.
+    Tile t lies in layer ``t // (columns * rows)``, row ``t % (columns * rows) // columns``, column ``t % columns``.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class VolumeData:
         Metres, world.
     counts : (3,) int64
     states : (n,) uint8
-        1 active; 0 inside geometry, weight 0 in every query.
+        1 active; 0 inside geometry: no tile, weight 0 in every query.
     offsets : (n, 3) float32
         Metres from the lattice point to where the probe stands.
     backface : (n,) float32
@@ -87,6 +87,12 @@ class VolumeData:
     distance_limit: float
     atlases: dict[str, Atlas]
 
+    @property
+    def tiles(self) -> NDArray[np.int64]:
+        """(n,) int64: each probe's tile in all atlases, -1 for one that has none. Tiles follow flat order."""
+        kept = self.states == 1
+        return np.where(kept, np.cumsum(kept) - 1, -1)
+
     def positions(self) -> F64:
         """Where the probes stand, offsets included: (n, 3) float64, world, in flat order."""
         lattice = np.stack(np.unravel_index(np.arange(len(self.states)), tuple(self.counts[::-1]))[::-1], -1)
@@ -104,7 +110,7 @@ class Bundle:
 
 
 FORMAT = "octobake-bundle"
-VERSION = 1
+VERSION = 2
 MANIFEST = "manifest.json"
 # EXR keeps channels in alphabetical order, R, G, B, A aside; these are in that order.
 CHANNELS = {
@@ -311,30 +317,38 @@ def _read_volume(folder: Path, v: dict[str, Any], files: dict[str, Any]) -> Volu
     n = int(np.prod(v["counts"]))
     packing = v["layout"]
     backface = np.asarray(v["probes"]["backface"], np.float32)
-    if len(v["counts"]) != 3 or backface.shape != (n,):
+    if len(v["counts"]) != 3 or backface.shape != (n,) or len(v["probes"]["states"]) != n:
         raise ValueError(f"volume {v['name']!r}: its counts are not those of its probes")
     atlases = {}
-    for file in (v["probes"]["file"], *(a["file"] for a in v["atlases"])):
+    for file in (v["probes"]["file"], *(a["file"] for a in v["atlases"] if a["file"] is not None)):
         if file not in files:
             raise ValueError(f"the digest of {file!r}")
     for a in v["atlases"]:
-        pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
-        height = packing["rows"] * a["tile"]
-        texels = pixels.reshape(packing["layers"], height, packing["columns"] * a["tile"], len(CHANNELS[a["output"]]))
+        size = (packing["layers"], packing["rows"] * a["tile"], packing["columns"] * a["tile"], len(CHANNELS[a["output"]]))
+        if a["file"] is None:
+            texels = np.broadcast_to(np.asarray(a["constant"], np.float32), size)
+        else:
+            pixels, _ = read_exr(folder / a["file"], BundleError, "bundle.damaged")
+            # One channel may stand for several.
+            names = list(dict.fromkeys(a["channels"]))
+            texels = np.ascontiguousarray(pixels[..., [names.index(name) for name in a["channels"]]]).reshape(size)
         atlases[a["output"]] = Atlas(
             a["output"], texels, a["tile"], a["interior"], packing["columns"], packing["rows"], packing["layers"], a["encoding"]
         )
     probes, _ = read_exr(folder / v["probes"]["file"], BundleError, "bundle.damaged")
     probes = probes.reshape(-1, 4)[:n]
-    return VolumeData(
+    volume = VolumeData(
         name=v["name"],
         origin=np.asarray(v["origin"], np.float64),
         spacing=np.asarray(v["spacing"], np.float64),
         counts=np.asarray(v["counts"], np.int64),
-        states=probes[:, 3].astype(np.uint8),
+        states=np.asarray(v["probes"]["states"], np.uint8),
         offsets=np.ascontiguousarray(probes[:, :3]),
         backface=backface,
         parameters=v["parameters"],
         distance_limit=float(v["distance_limit"]),
         atlases=atlases,
     )
+    if not np.array_equal(volume.tiles, probes[:, 3].astype(np.int64) - 1):
+        raise ValueError(f"volume {v['name']!r}: its states are not those of its probe table")
+    return volume

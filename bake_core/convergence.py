@@ -194,7 +194,7 @@ def relative_error(found: Spread) -> float:
     n = min(float(per_probe.sum()) ** 2 / float((per_probe**2).sum()) * (1 + 2 / found.degrees), len(per_probe))
     # The error itself scatters like χ² of n degrees of freedom, what is known of it like n times those of each: their quotient is
     # F-distributed.
-    return math.sqrt(mean * float(_f95(n, n * found.degrees)))
+    return math.sqrt(mean * float(f95(n, n * found.degrees)))
 
 
 def interval(means: F64, share: F64) -> tuple[F64, F64]:
@@ -226,10 +226,10 @@ def interval(means: F64, share: F64) -> tuple[F64, F64]:
     squares = np.asarray(sum(v**2 for v in variances)) / (SCRAMBLES_PER_HALF - 1)
     degrees = np.divide(total**2, squares, out=np.full_like(total, SCRAMBLES - HALVES), where=squares > 0)
     # Student's t squared is F with one degree of freedom above.
-    return middle, np.sqrt(_f95(1.0, degrees) * total)
+    return middle, np.sqrt(f95(1.0, degrees) * total)
 
 
-def _f95(m: float, n: Any) -> Any:
+def f95(m: float, n: Any) -> Any:
     """The 95 % point of the F distribution with m ≥ 1 and n ≥ 3 degrees of freedom: Paulson 1942, Ann. Math. Stat. 13(2).
 
     4 % too large at (1, 3), within 0.2 % from (2, 6) on.

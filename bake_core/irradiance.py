@@ -150,11 +150,14 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
         lattice = np.minimum(base + upper, volume.counts - 1)
         probe = lattice @ np.array([1, volume.counts[0], volume.counts[0] * volume.counts[1]])
         position = volume.origin + volume.spacing * lattice + table[probe, :3]
-        weight = _facing(position - positions, normals) * _visibility(volume, probe, biased - position)
+        kept = table[probe, 3] > 0
+        # A probe without a tile reads the first one, and counts for nothing.
+        tile = np.where(kept, table[probe, 3] - 1, 0).astype(np.int64)
+        weight = _facing(position - positions, normals) * _visibility(volume, tile, biased - position)
         probes[:, corner] = probe
-        other[:, corner] = _crush(weight) * table[probe, 3]
+        other[:, corner] = _crush(weight) * kept
         trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
-        light[:, corner] = bilinear(volume.atlases["irradiance"], probe, oct_toward)
+        light[:, corner] = bilinear(volume.atlases["irradiance"], tile, oct_toward)
     weights = trilinear * other
     # Where nothing is left, the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
     weights = np.where(weights.sum(-1, keepdims=True) > 0, weights, other)
@@ -163,14 +166,13 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
     return (weights[:, :, None] * light).sum(1), weights, probes
 
 
-def bilinear(atlas: Atlas, probe: I64, oct_xy: NDArray[np.floating]) -> F64:
-    """Bilinear look-up in probes' tiles. Mirrors ``obTile``, ``obTileCoordinates`` and a texture unit.
+def bilinear(atlas: Atlas, tile: I64, oct_xy: NDArray[np.floating]) -> F64:
+    """Bilinear look-up in tiles. Mirrors ``obTile``, ``obTileCoordinates`` and a texture unit.
 
     Parameters
     ----------
     atlas : Atlas
-    probe : (n,) int64
-        Flat indices.
+    tile : (n,) int64
     oct_xy : (n, 2) floating
         Points in [-1, 1]^2.
 
@@ -178,7 +180,7 @@ def bilinear(atlas: Atlas, probe: I64, oct_xy: NDArray[np.floating]) -> F64:
     -------
     (n, channels) float64
     """
-    row, column = np.divmod(probe, atlas.columns)
+    row, column = np.divmod(tile, atlas.columns)
     layer, row = np.divmod(row, atlas.rows)
     # Texel centres are at +0.5; the border is the first texel.
     x = 0.5 + (oct_xy[:, 0] * 0.5 + 0.5) * atlas.interior
@@ -201,15 +203,15 @@ def _facing(to_probe: F64, normals: F64) -> F64:
     return out
 
 
-def _visibility(volume: VolumeData, probe: I64, from_probe: F64) -> F64:
+def _visibility(volume: VolumeData, tile: I64, from_probe: F64) -> F64:
     """Mirrors ``obVisibility``."""
-    out = np.ones(len(probe))
+    out = np.ones(len(tile))
     r = np.minimum(np.linalg.norm(from_probe, axis=-1), volume.distance_limit)
     atlas = volume.atlases.get("visibility")
     if atlas is None:
         return out
     apart = np.flatnonzero(r > 0)
-    mean, square = bilinear(atlas, probe[apart], dir_to_oct(from_probe[apart])).T
+    mean, square = bilinear(atlas, tile[apart], dir_to_oct(from_probe[apart])).T
     beyond = r[apart] - mean
     variance = np.maximum(square - mean * mean, 1e-5 * square)
     bound = variance / np.maximum(variance + beyond * beyond, 1e-37)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bake_core.allocation import Allocation
+from bake_core.allocation import PILOT_SAMPLES, Allocation
 from bake_core.bake import Prepared, check_finite, compile_kernels, empty_state, prepare, trace_shard
 from bake_core.environment import Find, no_images
 from bake_core.scene import Scene
+from bake_core.selection import LeftOut
 from bake_core.spec import Spec
 
-# Probes that are traced to learn the scene's speed, spread evenly over the bake, and the samples each of them gets.
-_PILOT_PROBES, _PILOT_SAMPLES = 32, 4
+# Probes that are traced to learn a scene's speed and noise, spread evenly over the bake; each gets the samples of a bake's own pilot.
+_PILOT_PROBES = 32
 # An Embree 4 acceleration structure of triangles, of medium quality and robust, with its share of construction: bytes a triangle.
 _BVH_BYTES = 150
 # The interpreter with numba, Embree and OpenImageIO loaded.
@@ -30,13 +32,11 @@ class PlannedVolume:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A prediction.
+class Contents:
+    """What a bake will hold: known before a ray is traced.
 
     Attributes
     ----------
-    seconds : float
-        Of tracing, if the bake goes to its last sample.
     memory_bytes, atlas_bytes : int
         Resident memory at the end; texels before compression.
     """
@@ -44,11 +44,42 @@ class Plan:
     volumes: tuple[PlannedVolume, ...]
     probes: int
     outputs: tuple[str, ...]
-    left_out: tuple[tuple[str, str], ...]
-    paths_per_second: float
-    seconds: float
+    left_out: tuple[LeftOut, ...]
     memory_bytes: int
     atlas_bytes: int
+
+
+@dataclass(frozen=True)
+class Plan(Contents):
+    """A prediction.
+
+    Attributes
+    ----------
+    paths_per_second : float
+        As the pilot had them.
+    pilot_error : float or None
+        The error figure of the pilot's probes.
+    samples, seconds : int, float
+        Of a texel, and of tracing, until the target error is reached, if the error falls as that of independent samples; to the last sample
+        where there is no target.
+    most_seconds : float
+        If the bake goes to its last sample.
+    """
+
+    paths_per_second: float
+    pilot_error: float | None
+    samples: int
+    seconds: float
+    most_seconds: float
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A few probes traced: what a sample of every texel of one probe takes, what its distances take, and the error so far."""
+
+    sample_seconds: float
+    distance_seconds: float
+    error: float | None
 
 
 def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> Plan:
@@ -60,43 +91,55 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
         As the bake would.
     """
     prepared = prepare(scene, spec, find)
-    return predict(prepared, _paths_per_second(prepared, threads))
+    n = prepared.probe_count
+    compile_kernels(prepared, audited=False)
+    check_finite(prepared, threads=threads)
+    pilot = trace_pilot(prepared, threads)
+    samples = samples_needed(spec, pilot.error)
+    return Plan(
+        **vars(contents(prepared)),
+        paths_per_second=prepared.selection.capture**2 / pilot.sample_seconds,
+        pilot_error=pilot.error,
+        samples=samples,
+        seconds=n * (pilot.distance_seconds + samples * pilot.sample_seconds),
+        most_seconds=n * (pilot.distance_seconds + spec.stop.max_samples * pilot.sample_seconds),
+    )
 
 
-def predict(prepared: Prepared, speed: float) -> Plan:
-    """Predict a bake that traces so many paths a second."""
-    scene, spec, n, s = prepared.scene, prepared.spec, prepared.probe_count, prepared.selection
+def contents(prepared: Prepared) -> Contents:
+    """Tell what a prepared bake will hold."""
+    scene, n, s = prepared.scene, prepared.probe_count, prepared.selection
     one = empty_state(replace(prepared, positions=prepared.positions[:1]))
     state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
-    texels = {
-        "irradiance": (s.irradiance, 6),
-        "visibility": (s.visibility, 8),
-        "radiance": (s.capture, 6),
-        "distance": (s.distance, 4),
-        "normal": (s.normal, 6),
-    }
-    atlas_bytes = sum(n * (texels[o][0] + 2) ** 2 * texels[o][1] for o in s.outputs)
-    return Plan(
+    atlas_bytes = n * sum(s.map_bytes(o) for o in s.outputs)
+    return Contents(
         volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),
         probes=n,
         outputs=s.outputs,
-        left_out=s.left_out,
-        paths_per_second=speed,
-        seconds=n * s.capture**2 * spec.stop.max_samples / speed,
+        left_out=prepared.left_out,
         memory_bytes=int(_BASE_BYTES + scene.triangle_count * _BVH_BYTES + scene.positions.nbytes * 3 + 2 * state_bytes + 2 * atlas_bytes),
         atlas_bytes=atlas_bytes,
     )
 
 
-def _paths_per_second(prepared: Prepared, threads: int) -> float:
-    """Measured over probes spread evenly through the bake."""
+def samples_needed(spec: Spec, error: float | None) -> int:
+    """Samples to the target, judged by the error after the pilot: as independent ones have it, σ²/n. An estimate, no bound."""
+    stop = spec.stop
+    if stop.target_error is None or error is None:
+        return stop.max_samples
+    return int(min(max(math.ceil(PILOT_SAMPLES * (error / stop.target_error) ** 2), PILOT_SAMPLES // 2), stop.max_samples))
+
+
+def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
+    """Trace probes spread evenly through the bake."""
     n = prepared.probe_count
     chosen = np.unique(np.linspace(0, n - 1, min(_PILOT_PROBES, n)).astype(int))
-    compile_kernels(prepared)
-    check_finite(prepared, threads=threads)
-    given = Allocation.start(n)
-    started = time.perf_counter()
-    for probe in chosen:
-        trace_shard(prepared, (int(probe), int(probe) + 1), (1, 1 + _PILOT_SAMPLES), given, threads=threads)
-    paths = len(chosen) * prepared.selection.capture**2 * _PILOT_SAMPLES
-    return paths / max(time.perf_counter() - started, 1e-9)
+    few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen])
+    state, given, seconds = empty_state(few), Allocation.start(len(chosen)), []
+    for samples in ((0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)):
+        started = time.perf_counter()
+        state.add([trace_shard(few, (0, len(chosen)), samples, given, threads=threads)])
+        seconds.append(max(time.perf_counter() - started, 1e-9) / len(chosen))
+        given = state.allocation
+    # Both passes drew as many samples; the first looked for distances, too.
+    return Pilot(seconds[1] / (PILOT_SAMPLES // 2), max(seconds[0] - seconds[1], 0.0), state.error())

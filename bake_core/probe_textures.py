@@ -38,10 +38,10 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
     frame : (3,) float
         World position of the zero of the shader's frame, metres.
     """
-    first = np.cumsum([0] + [v.atlases["irradiance"].layers for v in volumes]).tolist()
     lines = []
     for i, (name, texels) in enumerate(zip(("Irradiance", "Visibility", "Probes"), _texels(volumes), strict=True)):
         height, width = (max(t.shape[axis] for t in texels) for axis in (1, 2))
+        first = np.cumsum([0] + [len(t) for t in texels]).tolist()
         lines.append(f"layout(set = 0, binding = {first_binding + i}) uniform sampler2DArray host{name};")
         # How far a volume's layers reach across the texture's, and which is its first.
         places = [f"vec3({t.shape[2] / width!r}, {t.shape[1] / height!r}, {layer}.0)" for t, layer in zip(texels, first, strict=False)]
@@ -59,13 +59,10 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
 
 
 def _texels(volumes: Sequence[VolumeData]) -> tuple[list[F32], list[F32], list[F32]]:
-    """Irradiance, visibility and probe tables, one array a volume; each volume has as many layers in all three."""
+    """Irradiance, visibility and probe tables, one array a volume."""
     irradiance = [v.atlases["irradiance"].texels for v in volumes]
     probes = [probe_texels(v) for v in volumes]
-    visibility = [
-        v.atlases["visibility"].texels if "visibility" in v.atlases else np.zeros((len(p), 1, 1, 2), np.float32)
-        for v, p in zip(volumes, probes, strict=True)
-    ]
+    visibility = [v.atlases["visibility"].texels if "visibility" in v.atlases else np.zeros((1, 1, 1, 2), np.float32) for v in volumes]
     return irradiance, visibility, probes
 
 

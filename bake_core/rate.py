@@ -44,6 +44,16 @@ def rate_by_seconds(curve: Sequence[Point], began: float) -> Rate:
     return _rate([p.seconds - began for p in curve], curve)
 
 
+def rate_of_runs(x: Sequence[float], errors: Sequence[float]) -> Rate:
+    """The slope through runs that share no samples, of errors above 0."""
+    told = [(a, e) for a, e in zip(x, errors, strict=True) if a > 0 and e > 0]
+    if len({a for a, _ in told}) < 2:
+        return Rate(len(told[:1]))
+    at, error = np.array(sorted(told), np.float64).T
+    slope, level, standard_error = fit_line(np.log(at), np.log(error))
+    return Rate(len(at), slope, math.exp(level), standard_error)
+
+
 def in_words(rate: Rate | None) -> str:
     """A rate as people read it, or why there is none; None is one against seconds of which nobody knows how many went into tracing."""
     if rate is None:
@@ -64,7 +74,7 @@ def _rate(x: Sequence[float], curve: Sequence[Point]) -> Rate:
     return Rate(len(told), slope, math.exp(level), standard_error)
 
 
-def fit_line(x: F64, y: F64, samples: F64) -> tuple[float, float, float | None]:
+def fit_line(x: F64, y: F64, samples: F64 | None = None) -> tuple[float, float, float | None]:
     """Weighted least squares through logarithms of errors whose passes share samples.
 
     Parameters
@@ -72,7 +82,7 @@ def fit_line(x: F64, y: F64, samples: F64) -> tuple[float, float, float | None]:
     x, y : (k,) float64
         From two points on.
     samples : (k,) float64
-        That each point's error was measured from; rising.
+        That each point's error was measured from; rising. None where each has samples of its own, shared with no other.
 
     Returns
     -------
@@ -88,7 +98,7 @@ def fit_line(x: F64, y: F64, samples: F64) -> tuple[float, float, float | None]:
     those. That is a Markov chain's correlation, so what is new in a point is its difference from ρ = m/n of the one before.
     Unweighted, the standard error would come out too small.
     """
-    rho = samples[:-1] / samples[1:]
+    rho = np.zeros(len(x) - 1) if samples is None else samples[:-1] / samples[1:]
     rows = np.stack([np.ones_like(x), x, y], 1)
     rows[1:] = (rows[1:] - rho[:, None] * rows[:-1]) / np.sqrt(1 - rho * rho)[:, None]
     design, value = rows[:, :2], rows[:, 2]

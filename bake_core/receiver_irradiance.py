@@ -97,7 +97,10 @@ def irradiance_at(
 
     def trace(first: int) -> int:
         part = slice(first, first + _CHUNK)
-        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), stands[part], first, samples, np.uint64(seed), flag, out[:, part])
+        # Rows of their own: a kernel is compiled for each way that an array may lie in memory.
+        into = np.zeros((scrambles, len(stands[part]), 3))
+        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), stands[part], first, samples, np.uint64(seed), flag, into)
+        out[:, part] = into
         return status
 
     with ThreadPoolExecutor(threads) as pool:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bake_core.audit import Audit, Figures
 from bake_core.bundle import dump_json
 from bake_core.convergence import Point, Verdict
 from bake_core.drawing import as_svg
@@ -34,6 +35,7 @@ class Run:
     stopped: Verdict = "continue"
     seconds: float = 0.0
     stages: dict[str, float] = field(default_factory=dict)
+    audit: Audit | None = None
 
     def rates(self) -> tuple[Rate, Rate | None]:
         """How fast the error fell, against samples and against seconds of tracing."""
@@ -96,7 +98,11 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         "bundle": document["content_digest"],
     }
     atlases = [
-        (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"]) for v in manifest["volumes"] for a in v["atlases"]
+        (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"] or "none: constant")
+        for v in manifest["volumes"]
+        for a in v["atlases"]
+        for v in manifest["volumes"]
+        for a in v["atlases"]
     ]
     curve = [(p["samples"], f"{p['rays']:,}", f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
     fitted = [(f"against {name}", in_words(rate)) for name, rate in zip(("samples", "seconds of tracing"), run.rates(), strict=True)]
@@ -105,7 +111,7 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         (p["volume"], p["probe"], ", ".join(f"{x:.4g}" for x in p["position"]), percent(p["error"]))
         for p in manifest["error"]["probes"]["worst"]
     ]
-    left_out = [(x["what"], x["why"]) for x in manifest["left_out"]]
+    left_out = [(x["what"], x["why"], f"{x['bytes']:,} bytes" if "bytes" in x else "time") for x in manifest["left_out"]]
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>octobake report</title>"
         "<style>body{font:16px system-ui;max-width:60rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse;margin:1rem 0}"
@@ -121,10 +127,11 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         + f"<p>Standard error of a probe: median {percent(manifest['error']['probes']['median'])}, "
         + f"95th percentile {percent(manifest['error']['probes']['p95'])}. The largest:</p>"
         + _table(("volume", "probe", "position", "standard error"), worst)
+        + _audited(run.audit)
         + "<h2>Atlases</h2>"
         + _table(("volume", "output", "stored as", "cost of storing", "file"), atlases)
         + "<h2>Left out</h2>"
-        + (_table(("what", "why"), left_out) if left_out else "<p>Nothing.</p>")
+        + (_table(("what", "why", "saves"), left_out) if left_out else "<p>Nothing.</p>")
         + "</html>\n"
     )
 
@@ -135,6 +142,50 @@ def _samples(manifest: dict[str, Any]) -> str:
     if mean >= manifest["samples"] or uniform is None:
         return str(manifest["samples"])
     return f"{manifest['samples']} at most, {mean:.0f} on average; the same error takes {uniform:.0f} if every probe gets as many"
+
+
+def audit_in_words(audit: Audit) -> str:
+    """One line: what was looked at, and what came of it."""
+    said = []
+    f = audit.texels.get("irradiance")
+    if f is not None:
+        said.append(
+            f"{f.places} irradiance texels err by {percent(f.error)} ({percent(f.low)} to {percent(f.high)}): "
+            f"sampling {percent(f.sampling)}, filtering {percent(f.filtering)}, encoding {percent(f.encoding)}"
+        )
+    if audit.surfaces is not None:
+        s = audit.surfaces
+        said.append(f"answers at {s.places} surface points by {percent(s.error)}, bias {100 * s.bias:+.2f} ± {percent(s.bias_within)}")
+    stated = "" if audit.stated is None else f": the stated {percent(audit.stated)} is {audit.verdict}"
+    return "; ".join(said) + stated
+
+
+def _audited(audit: Audit | None) -> str:
+    if audit is None:
+        return "<h2>Audit</h2><p>None.</p>"
+    head = ("", "places", "paths each", "error", "95 % interval", "sampling", "filtering", "encoding", "bias")
+
+    def row(name: str, f: Figures) -> tuple[str, ...]:
+        parts = (percent(x) for x in (f.sampling, f.filtering, f.encoding))
+        interval = f"{percent(f.low)} to {percent(f.high)}"
+        return (
+            name,
+            str(f.places),
+            str(2 * f.paths),
+            percent(f.error),
+            interval,
+            *parts,
+            f"{100 * f.bias:+.2f} ± {percent(f.bias_within)}",
+        )
+
+    rows = [row(f"{output} texels", f) for output, f in audit.texels.items()]
+    if audit.surfaces is not None:
+        rows.append(row("answers at surfaces, between probes", audit.surfaces))
+    return (
+        f"<h2>Audit</h2><p>In {audit.seconds:.1f} s, by paths that know nothing of how the bundle was made: the stated error of "
+        f"{percent(audit.stated)} is <b>{audit.verdict}</b>. Sampling error at surfaces: at most {percent(audit.surface_bound)}.</p>"
+        + _table(head, rows)
+    )
 
 
 def _output_error(error: float | None) -> str:

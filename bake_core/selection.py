@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,27 @@ from bake_core.spec import OUTPUTS, OutputName, Spec
 
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
 _CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
+# Of a texel as it is usually stored: halves of three colours, floats of two moments, one float, halves of a vector.
+_TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 8, "radiance": 6, "distance": 4, "normal": 6}
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """One thing that a bake does without.
+
+    Attributes
+    ----------
+    bytes : int or None
+        What that saves before compression; None where it saves no bytes but time.
+    """
+
+    what: str
+    why: str
+    bytes: int | None = None
+
+    def entry(self) -> dict[str, Any]:
+        """As the manifest has it."""
+        return {"what": self.what, "why": self.why} | ({} if self.bytes is None else {"bytes": self.bytes})
 
 
 @dataclass(frozen=True)
@@ -22,7 +44,8 @@ class Selection:
     ----------
     outputs : tuple of str
         What the bundle holds, in DESIGN's order.
-    left_out : tuple of (what, why)
+    left_out : tuple of LeftOut
+        Outputs, with what they would have taken.
     capture : int
         Texels along the radiance (capture) map's side, stored or not.
     irradiance, visibility, distance, normal : int
@@ -32,7 +55,7 @@ class Selection:
     """
 
     outputs: tuple[OutputName, ...]
-    left_out: tuple[tuple[str, str], ...]
+    left_out: tuple[LeftOut, ...]
     capture: int
     irradiance: int
     visibility: int
@@ -43,9 +66,21 @@ class Selection:
     def keeps(self, output: OutputName) -> bool:
         return output in self.outputs
 
+    def map_bytes(self, output: OutputName) -> int:
+        """What one probe's map takes before compression, border included."""
+        sides = {"radiance": self.capture, "irradiance": self.irradiance, "visibility": self.visibility}
+        side = sides.get(output, self.distance if output == "distance" else self.normal)
+        return (side + 2) ** 2 * _TEXEL_BYTES[output]
 
-def select(scene: Scene, spec: Spec) -> Selection:
-    """Choose outputs: what the spec demands, or what the scene's materials can make use of."""
+
+def select(scene: Scene, spec: Spec, probes: int) -> Selection:
+    """Choose outputs: what the spec demands, or what the scene's materials can make use of.
+
+    Parameters
+    ----------
+    probes : int
+        Of all volumes together.
+    """
     used = np.unique(scene.triangle_material)
     m = scene.materials
     # A metal of roughness 1 reflects as broadly as a matt surface does: its light is looked up in irradiance maps, too.
@@ -60,9 +95,9 @@ def select(scene: Scene, spec: Spec) -> Selection:
     # A power of two above four diagonals, so that the value says of itself that it is no measurement.
     miss = 2.0 ** math.ceil(math.log2(4 * max(float(np.linalg.norm(size)), 1e-6)))
     r = spec.resolution
-    return Selection(
+    chosen = Selection(
         outputs=kept,
-        left_out=tuple((o, why) for o in OUTPUTS if o not in kept),
+        left_out=(),
         capture=r.radiance or (_CAPTURE_GLOSSY if glossy else _CAPTURE_DIFFUSE),
         irradiance=r.irradiance,
         visibility=r.visibility,
@@ -70,3 +105,4 @@ def select(scene: Scene, spec: Spec) -> Selection:
         normal=r.normal,
         miss_distance=miss,
     )
+    return replace(chosen, left_out=tuple(LeftOut(o, why, probes * chosen.map_bytes(o)) for o in OUTPUTS if o not in kept))

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bake_core.atlas import layers_of
+
 if TYPE_CHECKING:  # the bundle's writer calls this module, so this module only names its types
     from bake_core.bundle import VolumeData
 
@@ -60,21 +62,22 @@ def bundle_constants(volumes: Sequence[VolumeData], frame: ArrayLike = (0.0, 0.0
 
 
 def probe_texels(volume: VolumeData) -> NDArray[np.float32]:
-    """The probe table of a volume: one texel a probe, in the tile layout of the volume's atlases.
+    """The probe table of a volume: one texel a probe, in flat order, with the columns and rows of the volume's atlases.
 
-    Read by ``OB_PROBE`` in ``shaders/irradiance.glsl``; texel (column, row) of layer l belongs to the tile at that place.
+    Read by ``OB_PROBE`` in ``shaders/irradiance.glsl``.
 
     Returns
     -------
     (layers, rows, columns, 4) float32
-        Offset from the lattice point in metres (x, y, z), then the state: 1 active, 0 inside geometry or no probe.
+        Offset from the lattice point in metres (x, y, z), then the number of the probe's tile, counted from 1; 0 where it has none.
     """
     atlas = next(iter(volume.atlases.values()))
-    texels = np.zeros((atlas.layers * atlas.rows * atlas.columns, 4), np.float32)
     n = len(volume.states)
+    layers = layers_of(n, atlas.columns, atlas.rows)
+    texels = np.zeros((layers * atlas.rows * atlas.columns, 4), np.float32)
     texels[:n, :3] = volume.offsets
-    texels[:n, 3] = volume.states
-    return texels.reshape(atlas.layers, atlas.rows, atlas.columns, 4)
+    texels[:n, 3] = volume.tiles + 1
+    return texels.reshape(layers, atlas.rows, atlas.columns, 4)
 
 
 def _volume(volume: VolumeData, frame: NDArray[np.float64]) -> str:

@@ -16,6 +16,7 @@ MAX_PROBES = 1 << 24
 # Beyond these a tile alone would be larger than any atlas a GPU takes (16,384 texels).
 MAX_RESOLUTION = 1024
 MAX_BOUNCES = 1 << 20
+SMALLEST_RESOLUTION = 2
 MAX_SAMPLES = 1 << 24
 
 
@@ -137,7 +138,7 @@ class SpotLight(_Model):
 
 Environment = Annotated[ConstantEnvironment | EquirectEnvironment, Field(discriminator="kind")]
 Light = Annotated[DirectionalLight | PointLight | SpotLight, Field(discriminator="kind")]
-Resolution_ = Annotated[Whole, Field(ge=2, le=MAX_RESOLUTION, multiple_of=2)]
+Resolution_ = Annotated[Whole, Field(ge=SMALLEST_RESOLUTION, le=MAX_RESOLUTION, multiple_of=2)]
 
 
 class Resolution(_Model):

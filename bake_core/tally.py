@@ -26,23 +26,25 @@ I64 = NDArray[np.int64]
 class Tally(Stored):
     """One shard's part of one pass.
 
+    Of a probe inside a solid only `backface` is known: the k probes of sums and maps are the shard's active ones, in order.
+
     Attributes
     ----------
     first_probe, end_probe : int
-        Half-open range of probes, numbered through the bake.
+        Half-open range of the p probes, numbered through the bake.
     first_sample, end_sample : int
         Half-open range of samples.
     taken : (p, HALVES) int64
         Samples that each half has had at its end.
-    irradiance : (p, SCRAMBLES, m, 3) float32
+    irradiance : (k, SCRAMBLES, m, 3) float32
         Sums.
-    radiance : (p, HALVES, capture texels, 3) float32
+    radiance : (k, HALVES, capture texels, 3) float32
         Sums, or (0, 0, 0, 0).
-    visibility : (p, v, v, 2) float32
+    visibility : (k, v, v, 2) float32
         Moments; of the first pass only, else (0, 0, 0, 0). So are the next three.
     backface : (p,) float32
-    distance : (p, d²) float32 or (0, 0)
-    normal : (p, n², 3) float32 or (0, 0, 0)
+    distance : (k, d²) float32 or (0, 0)
+    normal : (k, n², 3) float32 or (0, 0, 0)
     rays : int
         Traced for all of it.
     """
@@ -63,7 +65,7 @@ class Tally(Stored):
 
 @dataclass
 class State(Stored):
-    """Everything gathered so far, for all probes; arrays as in :class:`Tally`.
+    """Everything gathered so far, for all n probes; arrays as in :class:`Tally`, zeros for probes inside solids.
 
     Attributes
     ----------
@@ -102,21 +104,26 @@ class State(Stored):
             raise ValueError(f"a pass from sample {first} does not follow {self.samples} samples")
         for t in ordered:
             probes = slice(t.first_probe, t.end_probe)
-            self.taken[probes] = t.taken
-            self.irradiance[probes] += t.irradiance
-            self.rays += t.rays
-            if self.radiance.size:
-                self.radiance[probes] += t.radiance
             if first == 0:
                 self.backface[probes] = t.backface
+            kept = t.first_probe + np.flatnonzero(outside(self.backface[probes]))
+            self.taken[probes] = t.taken
+            self.irradiance[kept] += t.irradiance
+            self.rays += t.rays
+            if self.radiance.size:
+                self.radiance[kept] += t.radiance
+            if first == 0:
                 for name in ("visibility", "distance", "normal"):
                     if getattr(self, name).size:
-                        getattr(self, name)[probes] = getattr(t, name)
+                        getattr(self, name)[kept] = getattr(t, name)
+        if first == 0:
+            # Of what is inside a solid nothing is ever shown.
+            self.eighths[~self.active()] = 0
         self.samples = end
 
     def active(self) -> NDArray[np.bool_]:
         """(n,) bool: probes that stand outside geometry."""
-        return self.backface < BACKFACE_LIMIT
+        return outside(self.backface)
 
     @property
     def allocation(self) -> Allocation:
@@ -134,24 +141,22 @@ class State(Stored):
             own = spread(self.irradiance[active], drawn[active], self._share()[active], half)
             rates[active, half] = own.relative() * PILOT_SAMPLES / HALVES
         self.eighths[active] = densities(rates[active], stop.target_error, stop.max_samples)
-        # Of what is inside a solid nothing is ever shown.
-        self.eighths[~active] = 1
 
-    def mean(self, probes: slice = slice(None)) -> F64:
+    def mean(self, probes: slice | I64 = slice(None)) -> F64:
         """(p, m, 3) irradiance of every texel of some probes."""
         weight = np.repeat(self._per_sample()[probes], SCRAMBLES_PER_HALF, 1)
         mean: F64 = np.einsum("psmc,ps->pmc", self.irradiance[probes], weight)
         return mean
 
-    def mean_radiance(self, probes: slice = slice(None)) -> F64:
+    def mean_radiance(self, probes: slice | I64 = slice(None)) -> F64:
         """(p, capture texels, 3) radiance of every texel of some probes; only where it is kept."""
         mean: F64 = np.einsum("phtc,ph->ptc", self.radiance[probes], self._per_sample()[probes])
         return mean
 
-    def scramble_means(self) -> F64:
-        """(n, SCRAMBLES, m, 3) what each scramble alone says of irradiance; NaN where it has had no sample."""
+    def scramble_means(self, probes: slice | I64 = slice(None)) -> F64:
+        """(p, SCRAMBLES, m, 3) what each scramble alone says of some probes' irradiance; NaN where it has had no sample."""
         with np.errstate(invalid="ignore"):
-            return self.irradiance / self._drawn()[..., None, None].astype(np.float64)
+            return self.irradiance[probes] / self._drawn()[probes][..., None, None].astype(np.float64)
 
     def spread(self) -> Spread | None:
         """What the scrambles say of active probes' irradiance; None while not every scramble has had a sample."""
@@ -177,12 +182,16 @@ class State(Stored):
         return None if found is None else relative_error(found)
 
     def radiance_error(self) -> float | None:
-        """As :meth:`error`, of radiance texels: what two halves say of each; None where radiance is not kept or a half has no sample."""
+        """As :meth:`error`, of radiance texels: what two halves say of each; None where radiance is not kept or a half has no sample.
+
+        A texel counts as one number, not a probe: its paths are its own, and one degree of freedom says little of a few probes.
+        """
         if not self.radiance.size or self.samples < HALVES:
             return None
         active = self.active()
         a, b = np.moveaxis(self.radiance[active] / self.taken[active][:, :, None, None].astype(np.float64), 1, 0)
-        return relative_error(Spread((((a + b) / 2) ** 2).sum(-1), (((a - b) / 2) ** 2).sum(-1), HALVES - 1))
+        square, variance = (((x / 2) ** 2).sum(-1).reshape(-1, 1) for x in (a + b, a - b))
+        return relative_error(Spread(square, variance, HALVES - 1))
 
     def probe_errors(self) -> F64:
         """(n,) float64: each probe's own relative RMS standard error; NaN for inactive ones, and while it cannot be measured."""
@@ -230,3 +239,8 @@ class State(Stored):
 # A probe that sees back faces over more than a quarter of its sphere stands inside something, or behind it. RTXGI's default, which
 # its documentation gives for the same test; a probe beside an open box sees less than that of its back.
 BACKFACE_LIMIT = 0.25
+
+
+def outside(backface: F32) -> NDArray[np.bool_]:
+    """Which probes stand outside geometry, by the fraction of their spheres that sees backs."""
+    return backface < BACKFACE_LIMIT

@@ -87,12 +87,12 @@ def linear_to_srgb(linear: F64) -> F64:
     return out
 
 
-def texture_table(scene: Scene) -> TextureTable | None:
-    """The kernels' view of a scene's textures and holes; None where it has none."""
+def texture_table(scene: Scene, *, always: bool = False) -> TextureTable | None:
+    """The kernels' view of a scene's textures and holes; None where it has none, unless it is `always` wanted."""
     m = scene.materials
     unlit = m.unlit if m.unlit.any() else np.zeros(0, np.bool_)
     has_alpha = bool((m.alpha_mode[np.unique(scene.triangle_material)] != ALPHA_OPAQUE).any())
-    if not (scene.textures or has_alpha or unlit.size):
+    if not (always or scene.textures or has_alpha or unlit.size):
         return None
     vertex = np.zeros((0, 3), np.float32)
     if has_alpha and len(scene.colors) and (scene.colors[:, 3] < 1).any():

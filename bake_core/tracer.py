@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bake_core import embree
 from bake_core.environment import Environment, Sky
-from bake_core.ggx_albedo import AlbedoTable
+from bake_core.ggx_albedo import AlbedoTable, albedo_table
 from bake_core.lights import EmitterTable, LightTable, emitter_table, light_table, merge_lights
 from bake_core.materials import MaterialTable, gloss_table, material_table
 from bake_core.scene import Lights, Scene
@@ -101,6 +101,13 @@ class Tracer:
         if emits_unevenly(scene):
             tables = tables._replace(emitters=emitter_table(scene, mean_emission(tables, scene)))
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
+
+    def general(self, scene: Scene) -> Tracer:
+        """The same scene for kernels that know textures, holes and gloss, whether it has any or not: the same light, more slowly."""
+        tables = self.tables._replace(
+            gloss=self.tables.gloss or albedo_table(), textures=self.tables.textures or texture_table(scene, always=True)
+        )
+        return replace(self, tables=tables)
 
 
 def _normal_matrices(linear: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -165,13 +165,21 @@ class Validation(BaseModel):
     probes: int
 
 
+class LeftOut(BaseModel):
+    """One thing that a bake does without, as the bundle's manifest has it."""
+
+    what: str
+    why: str
+    bytes: int | None = Field(None, description="What that saves before compression; null where it saves time alone.")
+
+
 class Plan(BaseModel):
     """What a bake will do, known once its scene was prepared."""
 
     volumes: list[Volume]
     probes: int
     outputs: list[str]
-    left_out: list[tuple[str, str]] = Field(description="What, and why.")
+    left_out: list[LeftOut]
     memory_bytes: int = Field(description="Resident memory at the end, predicted.")
     atlas_bytes: int = Field(description="Texels before compression.")
 

@@ -6,7 +6,6 @@ that Dask's cancel raises.
 
 from __future__ import annotations
 
-import math
 import os
 import tempfile
 import threading
@@ -93,8 +92,8 @@ def prepare(work: Work) -> tuple[int, int, dict[str, Any]]:
     with _task(work):
         prepared = _prepared(work)
         # Its time is told while it runs, by what has been traced.
-        told = asdict(plan.predict(prepared, math.inf))
-        del told["paths_per_second"], told["seconds"]
+        held = plan.contents(prepared)
+        told = asdict(held) | {"left_out": [x.entry() for x in held.left_out]}
         if work.memory_bytes is not None and told["memory_bytes"] > work.memory_bytes:
             raise _over_memory(work, f"{told['memory_bytes']} bytes are predicted")
         return prepared.probe_count, work.own_threads, told
@@ -104,7 +103,7 @@ def compile_kernels(work: Work) -> None:
     """Compile what the scene needs, or fetch it from the cache: its time is no sample's. Then see that the scene has a finite answer."""
     with _task(work) as task:
         prepared = _prepared(work)
-        bake.compile_kernels(prepared)
+        bake.compile_kernels(prepared, audited=True)
         bake.check_finite(prepared, threads=work.own_threads, cancelled=task.flag)
 
 
@@ -144,11 +143,11 @@ def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> d
 
 def finish(work: Work, state: str, run: Run) -> dict[str, Any]:
     """Filter, encode and pack; answers the digests and sizes of the bundle, of its report and of a preview."""
-    with _task(work), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+    with _task(work) as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         out = Path(folder) / "bundle.zip"
         sums = _state(work, state)
-        bake.finish(_prepared(work), sums, run, out)
+        bake.finish(_prepared(work), sums, run, out, cancelled=task.flag)
         with zipfile.ZipFile(out) as bundle:
             report = Path(bundle.extract("report.json", folder))
         return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report), "preview": blobs.put_blob(_preview(sums, folder))}

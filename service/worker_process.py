@@ -11,19 +11,20 @@ import signal
 import sys
 import threading
 
-from distributed import Worker
-
-from service import worker as tasks
-from service.dask_configuration import configure
-
 
 def main(scheduler: str, folder: str) -> None:
-    """Work for the scheduler at this address until the service goes away."""
+    """Work for the scheduler at this address until the service goes away, be it while modules are still read."""
     # Ctrl-C in the service's terminal, and a service manager's SIGTERM to the whole group, are the service's to act on: a worker that
     # went by itself would be taken for lost.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_service, daemon=True).start()
+
+    from service import worker as tasks
+    from service.dask_configuration import configure
+
+    # Imported here although the scheduler would name it: the first task does not wait for it.
+    assert tasks
     configure()
     asyncio.run(_work(scheduler, folder))
 
@@ -35,11 +36,11 @@ def _end_with_the_service() -> None:
 
 
 async def _work(scheduler: str, folder: str) -> None:
+    from distributed import Worker
+
     async with Worker(scheduler, nthreads=1, host="127.0.0.1", dashboard=False, memory_limit=0, local_directory=folder) as worker:
         await worker.finished()
 
 
 if __name__ == "__main__":
-    # Imported here although the scheduler would name it: the first task does not wait for it.
-    assert tasks
     main(*sys.argv[1:])

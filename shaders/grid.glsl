@@ -6,7 +6,7 @@ struct ObVolume {
     vec3 origin;            // lattice point of probe (0, 0, 0)
     vec3 spacing;           // between neighbouring lattice points
     ivec3 counts;           // probes along x, y, z
-    ivec2 tiles;            // columns and rows of tiles in one layer of every atlas
+    ivec2 tiles;            // columns and rows of tiles in one layer of every atlas, and of texels in one of the probe table
     int irradianceTexels;   // interior texels along the side of a tile, without its border
     int visibilityTexels;   // likewise; 0: the bundle has no visibility, every probe counts as visible
     float distanceLimit;    // to which visibility distances were clamped
@@ -38,9 +38,13 @@ float obDistanceSquared(ObVolume volume, vec3 position) {
     return dot(d, d);
 }
 
-// Column, row and layer of a probe's tile, the same in every atlas. Probe (i, j, k) has the flat index i + nx * (j + ny * k).
-ivec3 obTile(ObVolume volume, ivec3 probe) {
-    int index = probe.x + volume.counts.x * (probe.y + volume.counts.y * probe.z);
+// Flat index of probe (i, j, k): i + nx * (j + ny * k).
+int obIndex(ObVolume volume, ivec3 probe) {
+    return probe.x + volume.counts.x * (probe.y + volume.counts.y * probe.z);
+}
+
+// Column, row and layer of a tile, the same in every atlas; of a probe's texel in the probe table, where the index is the probe's own.
+ivec3 obTile(ObVolume volume, int index) {
     int row = index / volume.tiles.x;
     int layer = row / volume.tiles.y;
     return ivec3(index - row * volume.tiles.x, row - layer * volume.tiles.y, layer);

@@ -42,7 +42,7 @@ float obCrush(float weight) {
 }
 
 // Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
-// (facing times visibility, crushed) times the probe's state (1, or 0 inside geometry). They are the surface's, whichever way is asked.
+// (facing times visibility, crushed); probes inside geometry have no tile and no weight. They are the surface's, whichever way is asked.
 vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 toward) {
     ObVolume volume = obVolume(v);
     ObCell cell = obCell(volume, position);
@@ -53,11 +53,15 @@ vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 towar
     for (int corner = 0; corner < 8; ++corner) {
         ivec3 upper = ivec3(corner & 1, (corner >> 1) & 1, corner >> 2);
         ivec3 probe = min(cell.base + upper, volume.counts - 1);
-        ivec3 tile = obTile(volume, probe);
-        vec4 state = OB_PROBE(v, tile);
-        vec3 probePosition = volume.origin + volume.spacing * vec3(probe) + state.xyz;
+        vec4 entry = OB_PROBE(v, obTile(volume, obIndex(volume, probe)));
+        // A probe without a tile counts for nothing.
+        if (entry.w == 0.0) {
+            continue;
+        }
+        ivec3 tile = obTile(volume, int(entry.w) - 1);
+        vec3 probePosition = volume.origin + volume.spacing * vec3(probe) + entry.xyz;
         float weight = obFacing(probePosition - position, normal) * obVisibility(v, volume, tile, biased - probePosition);
-        weight = obCrush(weight) * state.w;
+        weight = obCrush(weight);
         vec3 irradiance = OB_IRRADIANCE(v, obTileCoordinates(volume, tile, volume.irradianceTexels, octToward));
         vec3 axes = mix(1.0 - cell.fraction, cell.fraction, vec3(upper));
         sum += vec4(irradiance, 1.0) * (weight * axes.x * axes.y * axes.z);

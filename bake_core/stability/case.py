@@ -59,7 +59,6 @@ class Baker:
 
     folder: Path
     threads: int
-    cancelled: NDArray[np.uint8]
 
     def __call__(self, example: Example, **changes: Any) -> Bundle:
         """Bake an example with some of its spec's keys changed; the bundle as read back from disk.
@@ -73,7 +72,7 @@ class Baker:
         scene = self.folder / "scene.glb"
         scene.write_bytes(glb)
         out = self.folder / "bundle"
-        bake(scene, parse_spec({**spec, **changes}), out, threads=self.threads, find=beside(self.folder), cancelled=self.cancelled)
+        bake(scene, parse_spec({**spec, **changes}), out, threads=self.threads, find=beside(self.folder))
         bundle = read_bundle(out)
         for volume in bundle.volumes:
             for atlas in volume.atlases.values():
@@ -94,10 +93,10 @@ class Case:
 
 
 def maps(bundle: Bundle, output: str = "irradiance", volume: int = 0) -> F64:
-    """Every probe's map without borders, (n, t, t, channels)."""
+    """The map of every probe outside solids, in flat order, without borders: (n, t, t, channels)."""
     v = bundle.volumes[volume]
     a = v.atlases[output]
-    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), len(v.states)).astype(np.float64)
+    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(v.states.sum())).astype(np.float64)
 
 
 def near(expected: float, found: F64, relative: float, note: str) -> Result:

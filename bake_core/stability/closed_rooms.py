@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from bake_core.errors import SceneError
-from bake_core.examples import closed_box
+from bake_core.examples import closed_box, quads_part
+from bake_core.gltf.writer import GlbWriter
 from bake_core.stability.case import HALF_ROUNDING, SIGMAS, Baker, Case, Result, maps, near, one_probe, samples, sky
-from bake_core.stability.scenes import box_with_hole, scene
+from bake_core.stability.scenes import box, box_with_hole, scene
 from bake_core.transport import ROULETTE_DARK_VERTICES, ROULETTE_THROUGHPUT
 
 # Capture texels of a diffuse scene, a path each a sample.
@@ -55,11 +56,10 @@ def _nearly_closed(albedo: float, count: int) -> Case:
     return Case(f"albedo {albedo} in a box with a window", run)
 
 
-def _white_with_window(share: float) -> Case:
+def _white_with_window(share: float, count: int) -> Case:
     """Walls of exactly 1: radiance is 1 everywhere, though a path takes 1/share vertices to find the window."""
 
     def run(baker: Baker) -> Result:
-        count = 64
         glb = scene(box_with_hole(math.sqrt(24 * share) / 2), 1.0)
         bundle = baker((glb, {"volumes": _PROBES, "environment": sky(1.0)}), stop=samples(count))
         # A path leaves at each vertex with the window's share of the walls, x in 64 vertices; beyond those its weight grows as (m/64)².
@@ -92,6 +92,20 @@ def _endless(name: str, emission: float, **changes: object) -> Case:
     return Case(name, run)
 
 
+def white_sealed_with_a_lamp(baker: Baker) -> Result:
+    """A lamp in the middle of the sealed white box, itself as white."""
+    w = GlbWriter()
+    # Double-sided: a back would be black, take what meets it, and make the answer finite.
+    wall, lamp = w.material("wall", (1.0,) * 3), w.material("lamp", (1.0,) * 3, emission=(1.0,) * 3, double_sided=True)
+    glow = np.array([[-0.2, 0.3, -0.2], [0.2, 0.3, -0.2], [0.2, 0.3, 0.2], [-0.2, 0.3, 0.2]])
+    w.node(mesh=w.mesh("room", [quads_part(list(box()), wall), quads_part([glow], lamp)]))
+    try:
+        bundle = baker((w.to_glb(), {"volumes": _PROBES}), stop=samples(16))
+    except SceneError as e:
+        return Result("scene.light_never_ends", e.slug, 0.0, "refused before the first pass: no finite answer")
+    return Result("scene.light_never_ends", float(maps(bundle).mean()), 0.0, "a figure where none is true")
+
+
 def white_sealed_with_bounces(baker: Baker) -> Result:
     """The same box, its bounces limited: π Le (k + 1)."""
     k, count = 16, 64
@@ -119,11 +133,12 @@ CASES = (
     _furnace(0.999, 2),
     _nearly_closed(0.99, 8),
     _nearly_closed(0.999, 2),
-    _white_with_window(1e-2),
-    _white_with_window(1e-3),
+    _white_with_window(1e-2, 64),
+    _white_with_window(1e-3, 512),
     Case("albedo 1, sealed, light outside only", white_sealed_dark),
     _endless("albedo 1, sealed, walls that emit", 0.7),
     _endless("albedo 1, sealed, a point light inside", 0.0, lights=[{"kind": "point", "position": [0, 0, 0], "intensity": [1.0] * 3}]),
+    Case("albedo 1, sealed, a lamp inside", white_sealed_with_a_lamp),
     Case("albedo 1, sealed, 16 bounces", white_sealed_with_bounces),
     Case("a grazing slab of albedo 1", white_slab_in_the_plane),
 )

@@ -64,9 +64,9 @@ def inside_a_solid(baker: Baker) -> Result:
     inside, outside = bundle.volumes[0].states
     return Result(
         0.0,
-        float(inside) + (1.0 - float(outside)) + float(maps(bundle)[0].max()),
+        float(inside) + (1.0 - float(outside)) + abs(len(maps(bundle)) - 1.0),
         0.0,
-        "probes that are active inside or not outside, and light inside: none",
+        "probes that are active inside or not outside, and tiles but that of the one outside: none",
     )
 
 

@@ -46,22 +46,22 @@ def dim_beside_bright(baker: Baker) -> Result:
 
 
 def keyhole(baker: Baker) -> Result:
-    """A sun of 1e5 straight down through a hole of 1e-4 of the room's 24 m², one bounce: the patch on the floor, seen from ½ m."""
-    half, count, at = 0.025, 2048, (0.2, -0.5, 0.0)
+    """A sun of 1e5 straight down through a hole of 1e-4 of the room's 24 m², one bounce: the patch on the floor, seen from ¼ m."""
+    half, count, at = 0.025, 65536, (0.1, -0.75, 0.0)
     sun = {"kind": "directional", "direction": [0, -1, 0], "irradiance": [1e5] * 3}
     example = scene(box_with_hole(half), 0.5), {"volumes": one_probe(at), "lights": [sun], "max_bounces": 1}
     irradiance = maps(baker(example, stop=samples(count)))[0, :, :, 0]
     patch = np.array([[-half, -1, -half], [-half, -1, half], [half, -1, half], [half, -1, -half]])
     vector = np.abs(polygon_vector(patch, at)) * np.sign(np.array([0.0, -1.0, 0.0]) - at) * 0.5 * 1e5 / math.pi
     facing = texel_directions(8) @ vector / np.linalg.norm(vector)
-    # Receivers that see all of the patch, which is 0.1 rad wide.
-    whole = facing > 0.1
+    # Receivers that see all of the patch, which is 0.2 rad wide.
+    whole = facing > 0.2
     expected = float((facing[whole] * np.linalg.norm(vector)).mean())
     # Capture rays find the patch by chance: as many as fall into its solid angle (dω = dA/|v|³ on the octahedron).
     to = np.array([0.0, -1.0, 0.0]) - at
     distance = float(np.linalg.norm(to))
-    hits = _TEXELS * count / 4 / (np.abs(to).sum() / distance) ** 3 * (2 * half) ** 2 * (0.5 / distance) / distance**2
-    tolerance = SIGMAS / math.sqrt(hits)
+    hits = _TEXELS * count / 4 / (np.abs(to).sum() / distance) ** 3 * (2 * half) ** 2 * (-to[1] / distance) / distance**2
+    tolerance = SIGMAS / math.sqrt(hits) + HALF_ROUNDING
     note = (
         "mean over receivers that see the whole patch, a E/π times Lambert's polygon; "
         f"4σ of the {hits:.0f} rays in {_TEXELS * count} that find it: nothing draws light through a keyhole, so it costs samples"
@@ -169,7 +169,7 @@ def no_geometry(baker: Baker) -> Result:
 
 CASES = (
     Case("radiance 1e-6 beside 1e9", dim_beside_bright),
-    Case("a sun of 1e5 through a keyhole of 1e-4", keyhole),
+    Case("a sun of 1e5 through a keyhole of 1e-4", keyhole, slow=True),
     Case("an emitter of 1e-6 m²", tiny_emitter),
     _placed("the Cornell box scaled by 1e-4", scale=1e-4),
     _placed("the Cornell box scaled by 1e6", scale=1e6),

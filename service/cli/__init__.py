@@ -19,6 +19,7 @@ COMMANDS = (
     "sample",
     "verify",
     "stability",
+    "bench",
     "serve",
     "submit",
     "wait",

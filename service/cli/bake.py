@@ -19,7 +19,8 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, required=True, help="a folder, or a zip where it ends in .zip")
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
     parser.add_argument("--shards", type=positive, default=1, help="split each pass into this many parts; the bundle is the same")
-    parser.add_argument("--json", action="store_true", help="print one JSON document: bundle, digest, error, seconds, curve")
+    parser.add_argument("--audit-seconds", type=seconds, metavar="S", help="what the audit may take; default 3 %% of the bake, 0 for none")
+    parser.add_argument("--json", action="store_true", help="print one JSON document: bundle, digest, error, seconds, curve, audit")
     parser.set_defaults(run=run)
 
 
@@ -31,6 +32,14 @@ def positive(text: str) -> int:
     return value
 
 
+def seconds(text: str) -> float:
+    """An argparse type: a number from 0."""
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return value
+
+
 def run(args: argparse.Namespace) -> int:
     """Bake; 4 where the target error was not reached, or somebody stopped it before."""
     import numpy as np
@@ -38,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from bake_core import bundle
     from bake_core.bake import bake
     from bake_core.environment import beside
-    from bake_core.report import percent, rate_json
+    from bake_core.report import audit_in_words, percent, rate_json
     from bake_core.spec import load_spec
     from service.cli.progress import ProgressLine
 
@@ -69,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
             threads=args.threads,
             shards=args.shards,
             find=beside(args.spec.parent),
+            audit_seconds=args.audit_seconds,
             progress=line,
             point=line.point,
             cancelled=cancelled,
@@ -91,10 +101,13 @@ def run(args: argparse.Namespace) -> int:
             "seconds": done.seconds,
             "curve": [asdict(p) for p in done.curve],
             "rate": rate_json(done),
+            "audit": None if done.audit is None else asdict(done.audit),
         }
         print(json.dumps(document, indent=2))
     else:
         print(f"{args.out}: {probes} probes, {manifest['samples']} samples, error {percent(error)}, {done.seconds:.1f} s")
+        if done.audit is not None:
+            print(f"audit, {done.audit.seconds:.1f} s: {audit_in_words(done.audit)}")
     if done.stopped == "interrupt":
         print(f"octobake: interrupted; the bundle holds what {manifest['samples']} samples gave", file=sys.stderr)
     elif not result.met:

@@ -31,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
     from bake_core.rate import Rate, in_words
     from bake_core.report import percent
+    from service.cli.plan import left_out_lines
     from service.cli.progress import count
 
     error = manifest["error"]
@@ -48,9 +49,9 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         counts, inside = "×".join(map(str, v["counts"])), probes["count"] - probes["active"]
         lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry")
         for a in v["atlases"]:
-            cost = percent(a["encoding_error"])
-            lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {a['file']}")
-    lines += [f"left out   {x['what']}: {x['why']}" for x in manifest["left_out"]]
+            cost, file = percent(a["encoding_error"]), a["file"] or "no file, all texels are the same"
+            lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {file}")
+    lines += left_out_lines(manifest["left_out"])
     lines += [f"ignored    {line}" for line in manifest["scene"]["ignored"]]
     if report is not None:
         lines += ["", f"{'samples':>9}{'rays':>9}{'seconds':>10}{'error':>10}"]

@@ -138,6 +138,11 @@ def count(n: int) -> str:
     return str(n)
 
 
+def in_bytes(n: int) -> str:
+    """``940 bytes``, ``12 kB``, ``3.1 MB``: thousands, as disks are sold."""
+    return f"{n} bytes" if n < 1000 else f"{count(n)}B"
+
+
 def duration(seconds: float) -> str:
     """Seconds as people say them: ``3.2 s``, ``41 s``, ``5 min 07 s``, ``2 h 03 min``."""
     if seconds < 10:

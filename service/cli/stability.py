@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,35 +25,20 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run all cases; 5 where one fails."""
-    import numpy as np
+    from bake_core.stability import run as stability
 
-    from bake_core.stability.run import CASES, run_cases, table, write_report
-
-    cancelled = np.zeros(1, np.uint8)
-    done = 0
-
-    def tell(outcome: Outcome) -> None:
-        nonlocal done
-        done += 1
+    outcomes: list[Outcome] = []
+    for case in stability.CASES:
+        outcome = stability.run_apart(case.name, threads=args.threads)
+        outcomes.append(outcome)
         verdict = "pass" if outcome.result.passed else "FAIL"
-        print(f"{done}/{len(CASES)} {verdict} {outcome.name}, {outcome.seconds:.1f} s", file=sys.stderr, flush=True)
-
-    def stop(*_: object) -> None:
-        # Kernels only look at the flag; whatever else is going on (a compiler, a reader of a large scene) hears the exception.
-        cancelled.fill(1)
-        raise KeyboardInterrupt
-
-    previous = signal.signal(signal.SIGINT, stop)
-    try:
-        outcomes = run_cases(CASES, threads=args.threads, cancelled=cancelled, done=tell)
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    report = write_report(outcomes, args.out) if args.out else None
+        print(f"{len(outcomes)}/{len(stability.CASES)} {verdict} {outcome.name}, {outcome.seconds:.1f} s", file=sys.stderr, flush=True)
+    report = stability.write_report(outcomes, args.out) if args.out else None
     failed = [o.name for o in outcomes if not o.result.passed]
     if args.json:
         print(json.dumps({"cases": [o.document() for o in outcomes]}, indent=2))
     else:
-        rows = [("case", "expected", "measured", "tolerance", "verdict"), *table(outcomes)]
+        rows = [("case", "expected", "measured", "tolerance", "verdict"), *stability.table(outcomes)]
         widths = [max(len(row[i]) for row in rows) for i in range(5)]
         print("\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows))
         seconds = sum(o.seconds for o in outcomes)

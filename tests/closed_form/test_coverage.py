@@ -19,6 +19,20 @@ def test_intervals_hold_the_truth_as_often_as_they_say(name: str, make: Callable
     assert found.pairs >= 1000
     assert 0.93 <= found.probes <= 0.97
     assert 0.93 <= found.texels <= 0.97
+    # Adaptive sampling is on, and nothing that it saves is paid for in bias.
+    assert found.allotted < 0.95
+    assert abs(found.bias) < 4 * found.within < 0.01
+    # Of bakes that state a 95 % bound so many must hold it: all but what has a chance of less than 1 in 1,000.
+    assert found.bounded >= _least(found.seeds)
+
+
+def _least(bakes: int) -> int:
+    """The fewest of so many successes of probability 0.95 that come about more often than 1 time in 1,000: binomial."""
+    chance, fewest = 0.0, 0
+    while chance < 1e-3:
+        chance += math.comb(bakes, fewest) * 0.95**fewest * 0.05 ** (bakes - fewest)
+        fewest += 1
+    return fewest - 1
 
 
 def test_the_same_in_a_hurry() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bake_core.atlas import layout, pack
 from bake_core.bundle import Atlas, VolumeData
-from bake_core.octahedral import with_border
 
 PARAMETERS = {"normal_bias": 0.2, "view_bias": 0.8, "bias_scale": 0.225, "visibility_floor": 0.05, "visibility_sharpness": 50.0}
 
@@ -17,13 +17,12 @@ def sequence(count: int, first: int = 0) -> NDArray[np.float64]:
     return np.asarray(np.floor(golden * 1024) / 1024)
 
 
-def atlas(output: str, interior: NDArray[np.float64], counts: tuple[int, int, int]) -> Atlas:
-    """Pack (probes, n, n, channels) into the normal layout: columns = nx, rows = ny, layers = nz."""
-    nx, ny, nz = counts
-    n, channels = interior.shape[1], interior.shape[3]
-    tiles = with_border(interior.astype(np.float32)).reshape(nz, ny, nx, n + 2, n + 2, channels)
-    texels = np.ascontiguousarray(tiles.transpose(0, 1, 3, 2, 4, 5)).reshape(nz, ny * (n + 2), nx * (n + 2), channels)
-    return Atlas(output, texels, n + 2, n, nx, ny, nz, "float")
+def atlas(output: str, interior: NDArray[np.float64], counts: tuple[int, int, int], inactive: tuple[int, ...] = ()) -> Atlas:
+    """Pack (probes, n, n, channels), less those that are inactive, into a volume's layout."""
+    n = interior.shape[1]
+    kept = np.delete(interior, inactive, 0).astype(np.float32)
+    shape = layout(counts, n + 2, len(kept))
+    return Atlas(output, pack(kept, shape), n + 2, n, shape.columns, shape.rows, shape.layers, "float")
 
 
 def volume(
@@ -42,11 +41,11 @@ def volume(
     probes = counts[0] * counts[1] * counts[2]
     diagonal = float(np.hypot(np.hypot(spacing[0], spacing[1]), spacing[2]))
     light = sequence(probes * n * n * 3, seed).reshape(probes, n, n, 3) * 2
-    atlases = {"irradiance": atlas("irradiance", light, counts)}
+    atlases = {"irradiance": atlas("irradiance", light, counts, inactive)}
     if visibility:
         mean = (0.25 + sequence(probes * n * n, seed + 7).reshape(probes, n, n, 1)) * diagonal
         spread = 0.05 + 0.3 * sequence(probes * n * n, seed + 11).reshape(probes, n, n, 1)
-        atlases["visibility"] = atlas("visibility", np.concatenate([mean, mean**2 * (1 + spread**2)], -1), counts)
+        atlases["visibility"] = atlas("visibility", np.concatenate([mean, mean**2 * (1 + spread**2)], -1), counts, inactive)
     states = np.ones(probes, np.uint8)
     states[list(inactive)] = 0
     offsets = ((sequence(probes * 3, seed + 3).reshape(probes, 3) - 0.5) * 0.5 * np.asarray(spacing) * moved).astype(np.float32)

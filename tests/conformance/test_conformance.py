@@ -39,7 +39,7 @@ def volume_of(row: dict[str, Any]) -> VolumeData:
         origin=np.asarray(row["origin"]),
         spacing=spacing,
         counts=counts,
-        states=probes[:, 3].astype(np.uint8),
+        states=(probes[:, 3] > 0).astype(np.uint8),
         offsets=probes[:, :3],
         backface=np.zeros(len(probes), np.float32),
         parameters=parameters,

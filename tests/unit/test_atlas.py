@@ -9,7 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.atlas import HALF_MAX, HALF_TOLERANCE, MAX_LAYERS, MAX_SIDE, Layout, choose_encoding, encoding_error, layout, pack, unpack
+from bake_core.atlas import (
+    HALF_MAX,
+    HALF_TOLERANCE,
+    MAX_LAYERS,
+    MAX_SIDE,
+    Layout,
+    choose_encoding,
+    encoding_error,
+    layers_of,
+    layout,
+    pack,
+    unpack,
+)
 from bake_core.octahedral import with_border
 
 Array = NDArray[Any]
@@ -32,6 +44,19 @@ def test_larger_grids_fit_a_texture_all_the_same(counts: tuple[int, int, int], t
     assert shape.columns * shape.rows * (shape.layers - 1) < probes
     if probes <= (MAX_SIDE // tile) ** 2 * MAX_LAYERS:
         assert shape.layers <= MAX_LAYERS
+
+
+@pytest.mark.parametrize("counts", [(4, 3, 5), (16, 16, 2), (1, 1, 1), (7, 1, 1), (1, 300, 256), (300, 2, 300)])
+def test_what_is_left_out_wastes_less_than_a_row_in_each_layer_where_layers_may_be_many(counts: tuple[int, int, int]) -> None:
+    probes = math.prod(counts)
+    for kept in sorted({0, 1, probes // 3, probes - 1, probes} - {-1}):
+        shape = layout(counts, 10, kept)
+        places = shape.columns * shape.rows * shape.layers
+        assert max(kept, 1) <= places <= math.prod(vars(layout(counts, 10)).values())
+        assert max(shape.layers, layers_of(probes, shape.columns, shape.rows)) <= MAX_LAYERS
+        if probes <= shape.columns * MAX_LAYERS:
+            assert places - max(kept, 1) < shape.columns
+    assert layout(counts, 10, probes) == layout(counts, 10)
 
 
 @pytest.mark.parametrize(("shape", "n"), [(Layout(3, 2, 4), 24), (Layout(5, 2, 1), 7), (Layout(1, 1, 3), 3), (Layout(4, 3, 2), 13)])

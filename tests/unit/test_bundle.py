@@ -18,8 +18,9 @@ from bake_core import assemble, bundle, report
 from bake_core.bake import bake
 from bake_core.bundle import Bundle, check_replaceable, content_digest, read_bundle, read_report
 from bake_core.errors import BundleError, MachineError
-from bake_core.examples import closed_box
+from bake_core.examples import closed_box, cornell
 from bake_core.spec import Spec, parse_spec
+from tests.baking import bake_example
 
 STOP = {"target_error": None, "max_samples": 4}
 
@@ -67,6 +68,35 @@ def test_what_is_in_it(baked: Path) -> None:
     expected |= {f"shaders/{n}" for n in ("octahedral.glsl", "grid.glsl", "irradiance.glsl", "constants.glsl", "README.md")}
     assert set(files(baked / "bundle")) == expected
     assert {p.name for p in (baked / "bundle").iterdir()} >= {"report.json", "report.html", "report.svg", "report.png"}
+
+
+def test_maps_without_hue_have_one_channel_and_even_ones_no_file_unless_they_are_demanded(tmp_path: Path) -> None:
+    """A room that is dark, under its own spec and with all outputs demanded; a room of grey walls; and one with colours."""
+    dark, grey = closed_box(0.5, 0.0), closed_box(0.5, 1.0)
+    glb, spec = dark
+    demanded = {**spec, "outputs": ["irradiance", "visibility"]}
+    bundles = {}
+    for name, example in {"dark": dark, "demanded": (glb, demanded), "grey": grey, "colours": cornell()}.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        stop = {"target_error": None, "max_samples": 4}
+        few = {"volumes": [{"fit": "scene", "counts": [2, 2, 2]}]} if name == "colours" else {}
+        bundles[name] = bake_example(folder, (example[0], {**example[1], **few, "stop": stop}))
+
+    def entry(name: str) -> Any:
+        return bundles[name].manifest["volumes"][0]["atlases"][0]
+
+    even = entry("dark")
+    assert even["file"] is None and even["constant"] == [0.0, 0.0, 0.0]
+    assert entry("demanded")["file"] == "box.irradiance.exr" and entry("demanded")["channels"] == ["R", "G", "B"]
+    assert entry("grey")["channels"] == ["Y", "Y", "Y"] and entry("colours")["channels"] == ["R", "G", "B"]
+    even_texels, demanded_texels = (bundles[name].volumes[0].atlases["irradiance"].texels for name in ("dark", "demanded"))
+    np.testing.assert_array_equal(even_texels, demanded_texels)
+    texels = bundles["grey"].volumes[0].atlases["irradiance"].texels
+    assert texels.shape[-1] == 3 and texels.any() and (texels == texels[..., :1]).all()
+    said = {name: [x["what"] for x in b.manifest["left_out"] if ":" in x["what"]] for name, b in bundles.items()}
+    assert said["dark"] == ["box: irradiance map"] and said["grey"] == ["box: irradiance in colour"]
+    assert not said["demanded"] and not said["colours"]
 
 
 def test_folder_and_zip_hold_the_same(baked: Path) -> None:
@@ -194,7 +224,7 @@ def test_what_is_no_bundle_is_said_to_be_none(tmp_path: Path, folder: Path) -> N
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("manifest.json", '{"format": "other"}')
     assert refused(tmp_path / "other.zip").slug == "bundle.not_a_bundle"
-    edit(folder, lambda m: m.update(version=2))
+    edit(folder, lambda m: m.update(version=1))
     assert refused(folder).slug == "bundle.version"
     edit(folder, lambda m: m.update(format="other"))
     assert refused(folder).slug == "bundle.not_a_bundle"

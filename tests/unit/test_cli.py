@@ -66,7 +66,8 @@ def test_bake_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str
     scene, spec_file = write(tmp_path, glb, {**spec, "stop": FEW})
     assert main(["bake", scene, "--spec", spec_file, "-o", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert len(out.splitlines()) == 1 and "8 probes, 4 samples" in out
+    baked, audited = out.splitlines()
+    assert "8 probes, 4 samples" in baked and audited.startswith("audit, ")
     assert "tracing" in err and "\r" not in err  # plain lines: this is no terminal
     read_bundle(tmp_path / "out")
 
@@ -291,11 +292,14 @@ def test_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, spec_file = write(tmp_path, *closed_box(0.5, 1.0))
     assert main(["plan", scene, "--spec", spec_file]) == 0
     text = capsys.readouterr().out
-    for word in ("2×2×2", "irradiance, visibility", "left out", "seconds", "memory", "atlases"):
+    for word in ("2×2×2", "irradiance, visibility", "left out", "saves", "time", "memory"):
         assert word in text
     assert main(["plan", scene, "--spec", spec_file, "--json", "--threads", "1"]) == 0
     told = document(capsys)
     assert told["probes"] == 8 and told["outputs"] == ["irradiance", "visibility"] and told["seconds"] > 0
+    assert told["measured"] is None and told["left_out"][0].keys() == {"what", "why", "bytes"}
+    assert main(["plan", scene, "--spec", spec_file, "--measure", "--threads", "1"]) == 0
+    assert "left out" in (text := capsys.readouterr().out) and "same texels box.irradiance" in text and "others" not in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.glb", "spec.json"]
 
 

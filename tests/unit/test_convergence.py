@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF, of_half
-from bake_core.convergence import Point, _f95, decide, fit_pass, next_pass, relative_error, spread
+from bake_core.convergence import Point, decide, f95, fit_pass, next_pass, relative_error, spread
 from bake_core.spec import Stop
 
 Array = NDArray[Any]
@@ -157,7 +157,7 @@ def test_the_bound_holds_where_a_few_probes_make_all_the_error() -> None:
 def test_f_distribution() -> None:
     """Against the printed table."""
     for m, n, quantile in ((1, 3, 10.128), (2, 6, 5.143), (4, 12, 3.259), (8, 24, 2.355), (30, 90, 1.586)):
-        assert _f95(m, n) == pytest.approx(quantile, rel=0.04 if m == 1 else 0.002)
+        assert f95(m, n) == pytest.approx(quantile, rel=0.04 if m == 1 else 0.002)
 
 
 def test_more_samples_make_it_smaller_by_the_square_root() -> None:
