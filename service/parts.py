@@ -8,6 +8,7 @@ import shutil
 from bake_core.errors import MachineError
 from service.blobs import Blobs
 from service.hub import Hub
+from service.sandbox import Sandbox
 from service.scenes import Outlines
 from service.scheduler import Scheduler
 from service.settings import Settings
@@ -36,7 +37,8 @@ class Service:
         self.blobs = Blobs(settings.store_url, folder / "scratch")
         self.blobs.clean()
         self.store = Store(settings.database_url)
-        self.outlines = Outlines(self.blobs)
+        self.sandbox = Sandbox(settings.temporary_folder, settings.read_seconds, settings.read_memory)
+        self.outlines = Outlines(self.blobs, self.sandbox)
         self.hub = Hub()
         self.scheduler = Scheduler(settings, self.store, self.blobs, self.hub)
 
@@ -45,6 +47,7 @@ class Service:
         try:
             self.scheduler.close()
         finally:
+            self.sandbox.close()
             self.store.close()
             self._sweep()
             self._lock.close()

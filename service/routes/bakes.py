@@ -43,7 +43,7 @@ def create_bake(body: documents.BakeRequest, service: Here, response: Response) 
         raise RequestError("scene.unknown", f"there is no scene {body.scene}; add it with POST /v1/scenes", "body.scene", 422)
     # Volumes that do not fit this scene, and skies that cannot be read, are refused now, not after a wait in the queue.
     place(service.outlines.get(body.scene, scene), spec)
-    check_sky(service.blobs, spec.environment)
+    check_sky(service.sandbox, service.blobs, spec.environment)
     job = service.store.add_job(Kind.BAKE, {"scene": body.scene, "spec": spec.canonical()}, body.labels, body.priority)
     accepted(service, response, job, PATH)
     return _document(service, job, False)
