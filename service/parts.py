@@ -6,11 +6,12 @@ import fcntl
 import shutil
 
 from bake_core.errors import MachineError
-from service.audit import Audit
 from service.blobs import Blobs
 from service.hub import Hub
+from service.ledger import Ledger
 from service.outbox import Outbox
 from service.retention import Retention
+from service.sandbox import Sandbox
 from service.scenes import Outlines
 from service.scheduler import Scheduler
 from service.settings import Settings
@@ -41,9 +42,10 @@ class Service:
         self.blobs = Blobs(settings.store_url, folder / "scratch")
         self.blobs.clean()
         self.store = Store(settings.database_url)
-        self.outlines = Outlines(self.blobs)
+        self.sandbox = Sandbox(settings.temporary_folder, settings.read_seconds, settings.read_memory)
+        self.outlines = Outlines(self.blobs, self.sandbox)
         self.hub = Hub()
-        self.audit = Audit(folder)
+        self.ledger = Ledger(folder)
         self.tokens = Tokens(self.store.engine)
         self.outbox = Outbox(self.store.engine)
         self.retention = Retention(settings, self.store, self.blobs)
@@ -63,8 +65,9 @@ class Service:
             self.scheduler.close()
             self.webhooks.close()
         finally:
+            self.sandbox.close()
             self.store.close()
-            self.audit.close()
+            self.ledger.close()
             self._sweep()
             self._lock.close()
 

@@ -37,6 +37,8 @@ class Settings:
     threads: int = _setting(0, "Threads a worker bakes with; 0 takes every CPU that this process may use.")
     max_json_bytes: int = _setting(16 * 2**20, "Largest JSON body accepted. A spec with the most lights it may have (65,536) is 11 MB.")
     max_upload_bytes: int = _setting(4 * 2**30, "Largest blob or GLB accepted. A GLB's own length field ends at 4 GiB.")
+    read_seconds: int = _setting(300, "Seconds in which an uploaded scene or image must be read, or be refused.")
+    read_memory: int = _setting(8 * 2**30, "Bytes of memory that reading one uploaded scene or image may take; two are read at once.")
     max_attempts: int = _setting(3, "How often one piece of a job may lose its worker before the job fails as crashed.")
     shard_seconds: float = _setting(3.0, "Work between two commits, aimed at: what a restart or a killed worker costs at most.")
     cached_scenes: int = _setting(2, "Scenes that a worker keeps ready between jobs.")

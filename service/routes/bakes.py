@@ -160,7 +160,7 @@ def _validate(service: Service, body: documents.BakeRequest) -> tuple[Spec, tupl
     if scene is None:
         raise RequestError("scene.unknown", f"there is no scene {body.scene}; add it with POST /v1/scenes", "body.scene", 422)
     volumes = place(service.outlines.get(body.scene, scene), spec)
-    check_sky(service.blobs, spec.environment)
+    check_sky(service.sandbox, service.blobs, spec.environment)
     return spec, volumes
 
 
@@ -179,7 +179,7 @@ def _digests(service: Service, scene: str, spec: dict[str, Any]) -> list[str]:
 
 
 def _needs(service: Service, job: Job) -> list[str]:
-    check_sky(service.blobs, parse_spec(job.request["spec"]).environment)
+    check_sky(service.sandbox, service.blobs, parse_spec(job.request["spec"]).environment)
     return _digests(service, job.request["scene"], job.request["spec"])
 
 

@@ -118,7 +118,7 @@ class Guard:
 
     def _write(self, name: str, address: str, method: str, path: str, status: int) -> None:
         assert self._service is not None
-        self._service.audit.write(token=name, address=address, method=method, path=path, status=status)
+        self._service.ledger.write(token=name, address=address, method=method, path=path, status=status)
 
 
 class _Rates:

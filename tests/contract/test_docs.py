@@ -93,7 +93,9 @@ def test_every_slug_of_the_spec_is_documented() -> None:
 # --- errors ----------------------------------------------------------------------------------------------------------------------------
 
 # Words with a dot that are names of files, of modules or of places in a request.
-NO_SLUGS = r"(json|html|glb|gltf|zip|glsl|vert|frag|log|js|css|exr|cli|url|id|scene|bake|cameras|thresholds|worker_process|txt)"
+NO_SLUGS = (
+    r"(json|html|glb|gltf|zip|glsl|vert|frag|log|js|css|exr|cli|url|id|scene|bake|cameras|thresholds|worker_process|reader_process|txt)"
+)
 AREAS = (
     "bake|bench|blob|bundle|camera|client|compute|demo|gltf|job|machine|request|sample|scene|service|settings|shaders|spec|thresholds|token"
     "|verification|vulkan"

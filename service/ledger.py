@@ -11,14 +11,14 @@ from pathlib import Path
 FILE_BYTES, OLD_FILES = 32 * 2**20, 4
 
 
-class Audit:
+class Ledger:
     """``audit.jsonl`` in a folder: a JSON document a line. When it is full it is set aside, and the oldest of a few such files goes."""
 
     def __init__(self, folder: Path) -> None:
         self._handler = RotatingFileHandler(
             folder / "audit.jsonl", maxBytes=FILE_BYTES, backupCount=OLD_FILES, encoding="utf-8", delay=True
         )
-        self._log = logging.Logger("octobake.audit")
+        self._log = logging.Logger("octobake.ledger")
         self._log.addHandler(self._handler)
 
     def write(self, **record: str | int) -> None:
