@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from bake_core.convergence import Verdict
 from bake_core.embree import instruction_set
 from bake_core.errors import BakeError
 from bake_core.filtering import VISIBILITY_SHARPNESS
+from bake_core.gloss_levels import gloss_alphas
 from bake_core.images import write_exr
 from bake_core.placement import Volume
 from bake_core.scene import Scene
@@ -25,6 +27,7 @@ from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.shader_files import shader_dir
 from bake_core.spec import OutputName, Spec
 from bake_core.tally import State
+from bake_core.volume_chains import CHAINS, chain_levels, chain_size, traceable, volume_chain
 
 F32 = NDArray[np.float32]
 
@@ -209,6 +212,7 @@ def _volume(
             _write_layers(folder / entry["file"], atlas.texels, tuple(dict.fromkeys(entry["channels"])), half=encoding == "half")
         if output == "distance":
             entry["miss"] = selection.miss_distance
+            atlas = replace(atlas, miss=selection.miss_distance)
         atlases[output] = atlas
         described.append(entry)
     states = np.where(active[probes], 1, np.where(state.needed[probes], 0, 2)).astype(np.uint8)
@@ -245,8 +249,22 @@ def _volume(
             "backface": [float(str(b)) for b in state.backface[probes]],
         },
         "atlases": described,
+        "chains": [_chain(content, chain, folder) for chain in CHAINS] if traceable([content]) else [],
     }
     return entry, content
+
+
+def _chain(volume: VolumeData, chain: str, folder: Path) -> dict[str, Any]:
+    """Write a chain; its entry in the manifest."""
+    file = f"{volume.name}.{chain}.exr"
+    half = chain == "gloss" and volume.atlases["radiance"].encoding == "half"
+    _write_layers(folder / file, volume_chain(volume, chain), ("R", "G", "B") if chain == "gloss" else (chain,), half=half)
+    levels: list[dict[str, Any]] = [{"x": x, "y": y, "side": side} for x, y, side in chain_levels(volume, chain)]
+    if chain == "gloss":
+        alphas = gloss_alphas(volume.atlases["radiance"].interior)
+        levels = [{**level, "alpha": alpha} for level, alpha in zip(levels, alphas, strict=True)]
+    width, height = chain_size(volume, chain)
+    return {"chain": chain, "file": file, "encoding": "half" if half else "float", "width": width, "height": height, "levels": levels}
 
 
 def _interior(output: OutputName, selection: Selection, state: State, probes: slice) -> F32:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -41,6 +42,8 @@ class Atlas:
     columns, rows, layers : int
     encoding : str
         ``half`` or ``float``: how the file stores it.
+    miss : float
+        Of distances: what stands for no surface, metres.
     """
 
     output: str
@@ -51,6 +54,7 @@ class Atlas:
     rows: int
     layers: int
     encoding: str
+    miss: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ CHANNELS = {
     "normal": ("x", "y", "z"),
     "probes": ("R", "G", "B", "A"),
 }
-SHADERS = ("octahedral.glsl", "grid.glsl", "irradiance.glsl")
+SHADERS = ("octahedral.glsl", "grid.glsl", "irradiance.glsl", "trace.glsl")
 # ZIP cannot say earlier; every entry carries it, so that the same bundle is the same bytes.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -332,9 +336,8 @@ def _read_volume(folder: Path, v: dict[str, Any], files: dict[str, Any]) -> Volu
             # One channel may stand for several.
             names = list(dict.fromkeys(a["channels"]))
             texels = np.ascontiguousarray(pixels[..., [names.index(name) for name in a["channels"]]]).reshape(size)
-        atlases[a["output"]] = Atlas(
-            a["output"], texels, a["tile"], a["interior"], packing["columns"], packing["rows"], packing["layers"], a["encoding"]
-        )
+        shape = (packing["columns"], packing["rows"], packing["layers"])
+        atlases[a["output"]] = Atlas(a["output"], texels, a["tile"], a["interior"], *shape, a["encoding"], a.get("miss", math.inf))
     probes, _ = read_exr(folder / v["probes"]["file"], BundleError, "bundle.damaged")
     probes = probes.reshape(-1, 4)[:n]
     volume = VolumeData(

@@ -61,6 +61,30 @@ def oct_to_dir(oct_xy: NDArray[np.floating]) -> NDArray[np.floating]:
     return unit
 
 
+def wrap_oct(oct_xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Points a little outside the square, as texels of a border are, to the points of the square that they stand for.
+
+    Crossing an edge at height y comes back through the same edge at -y. Mirrors ``obWrapOct`` in ``shaders/trace.glsl``.
+
+    Parameters
+    ----------
+    oct_xy : (..., 2) floating
+        Points in (-3, 3)^2.
+
+    Returns
+    -------
+    (..., 2), dtype of `oct_xy`
+        Points in [-1, 1]^2.
+    """
+    p = np.array(oct_xy)
+    for axis in (0, 1):
+        over = np.abs(p[..., axis]) > 1
+        along = np.where(p[..., axis] > 0, 2, -2) - p[..., axis]
+        p[..., axis] = np.where(over, along, p[..., axis])
+        p[..., 1 - axis] = np.where(over, -p[..., 1 - axis], p[..., 1 - axis])
+    return p
+
+
 def texel_directions(n: int) -> F64:
     """Directions through the centres of an n×n map's texels.
 

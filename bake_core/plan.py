@@ -40,24 +40,14 @@ class PlannedVolume:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A prediction.
+class Contents:
+    """What a bake will hold: known before a ray is traced.
 
     Attributes
     ----------
     unneeded_probes, unneeded_bytes : int
         Probes that no query on a surface asks, and what their texels take before compression: left out where the spec's receivers are
         surfaces, and could be where they are not.
-    paths_per_second : float
-        As the pilot had them.
-    pilot_error : float or None
-        What the error figure of all probes would be after the pilot's samples, judged by the pilot's probes.
-    samples, seconds : int, float
-        Of a texel of the hardest probes, and of tracing, until the target error is reached; to the last sample where there is no target.
-    least_seconds, greatest_seconds : float
-        Between which `seconds` may well lie, given how few probes the pilot had and how little it knows of the rate.
-    most_seconds : float
-        If the bake goes to its last sample.
     memory_bytes, atlas_bytes : int
         Resident memory at the end; texels before compression.
     """
@@ -68,6 +58,28 @@ class Plan:
     left_out: tuple[LeftOut, ...]
     unneeded_probes: int
     unneeded_bytes: int
+    memory_bytes: int
+    atlas_bytes: int
+
+
+@dataclass(frozen=True)
+class Plan(Contents):
+    """A prediction.
+
+    Attributes
+    ----------
+    paths_per_second : float
+        As the pilot had them.
+    pilot_error : float or None
+        What the error figure of all probes would be after the pilot's samples, judged by the pilot's probes.
+    samples, seconds : int, float
+        Of a texel of the hardest probes, and of tracing, until the target error is reached; to the last sample where there is no target.
+    least_seconds, greatest_seconds : float
+        Between which `seconds` may well lie, given how few probes the pilot had and how little it knows of the rate.
+    most_seconds : float
+        If the bake goes to its last sample.
+    """
+
     paths_per_second: float
     pilot_error: float | None
     samples: int
@@ -75,8 +87,6 @@ class Plan:
     least_seconds: float
     greatest_seconds: float
     most_seconds: float
-    memory_bytes: int
-    atlas_bytes: int
 
 
 @dataclass(frozen=True)
@@ -127,7 +137,6 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
         As the bake would.
     """
     prepared = prepare(scene, spec, find)
-    n, s = prepared.probe_count, prepared.selection
     compile_kernels(prepared, audited=False)
     check_finite(prepared, threads=threads)
     pilot = trace_pilot(prepared, threads)
@@ -136,12 +145,6 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     _, least = samples_needed(spec.stop, replace(pilot, variance=pilot.variance / noise))
     _, greatest = samples_needed(spec.stop, replace(pilot, variance=pilot.variance * noise, fall=1.0))
     _, most = samples_needed(spec.stop.model_copy(update={"target_error": None}), pilot)
-    one = empty_state(replace(prepared, positions=prepared.positions[:1], needed=prepared.needed[:1]))
-    state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
-    asked = prepared.needed if spec.receivers == "surfaces" else needed_probes(scene, prepared.volumes)
-    edges = np.cumsum([0] + [v.probe_count for v in prepared.volumes])
-    sizes = [sum(s.map_bytes(o) for o in s.of(i)) for i in range(len(prepared.volumes))]
-    stored = sum(size * int(prepared.needed[a:b].sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True))
     traced = int(prepared.needed.sum())
 
     def seconds(taken: F64) -> float:
@@ -149,19 +152,33 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
 
     per_sample = float(pilot.seconds.mean()) if traced else 0.0
     return Plan(
-        volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),
-        probes=n,
-        outputs=s.outputs,
-        left_out=prepared.left_out,
-        unneeded_probes=n - int(asked.sum()),
-        unneeded_bytes=sum(size * int((~asked[a:b]).sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)),
-        paths_per_second=float(pilot.active.mean()) * s.capture**2 / per_sample if per_sample else 0.0,
+        **vars(contents(prepared)),
+        paths_per_second=float(pilot.active.mean()) * prepared.selection.capture**2 / per_sample if per_sample else 0.0,
         pilot_error=error_bound(pilot.variance, pilot.degrees, pilot.times),
         samples=samples,
         seconds=seconds(taken),
         least_seconds=seconds(least) / pace,
         greatest_seconds=seconds(greatest) * pace,
         most_seconds=seconds(most),
+    )
+
+
+def contents(prepared: Prepared) -> Contents:
+    """Tell what a prepared bake will hold."""
+    scene, spec, n, s = prepared.scene, prepared.spec, prepared.probe_count, prepared.selection
+    one = empty_state(replace(prepared, positions=prepared.positions[:1], needed=prepared.needed[:1]))
+    state_bytes = n * sum(a.nbytes for a in vars(one).values() if isinstance(a, np.ndarray))
+    asked = prepared.needed if spec.receivers == "surfaces" else needed_probes(scene, prepared.volumes)
+    edges = np.cumsum([0] + [v.probe_count for v in prepared.volumes])
+    sizes = [sum(s.map_bytes(o) for o in s.of(i)) for i in range(len(prepared.volumes))]
+    stored = sum(size * int(prepared.needed[a:b].sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True))
+    return Contents(
+        volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),
+        probes=n,
+        outputs=s.outputs,
+        left_out=prepared.left_out,
+        unneeded_probes=n - int(asked.sum()),
+        unneeded_bytes=sum(size * int((~asked[a:b]).sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)),
         memory_bytes=int(_BASE_BYTES + scene.triangle_count * _BVH_BYTES + scene.positions.nbytes * 3 + 2 * state_bytes + 2 * stored),
         atlas_bytes=stored,
     )

@@ -1,4 +1,4 @@
-"""A bundle's volumes on a Vulkan device: three textures for all of them, and the reference GLSL module bound to these.
+"""A bundle's volumes on a Vulkan device: a few textures for all of them, and the reference GLSL module bound to these.
 
 Devices bind few samplers at a time, so the volumes lie in one array texture an output, layers after layers; each is put into the
 lower corner of a layer as large as the largest needs.
@@ -7,6 +7,7 @@ lower corner of a layer as large as the largest needs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,18 +15,61 @@ from numpy.typing import ArrayLike, NDArray
 from bake_core.bundle import VolumeData
 from bake_core.shader_compiler import module_source
 from bake_core.shader_constants import bundle_constants, probe_texels
+from bake_core.volume_chains import CHAINS, chain_shape, traceable, volume_chain
 from bake_core.vulkan import Device, Image, texture
 
 F32 = NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class _Map:
+    """What one texture holds, and what GLSL takes from it.
+
+    `source` is an output, ``probes`` or a chain; `components` are those of a texel that its macro gives, `linear` says how it is read.
+    """
+
+    source: str
+    kind: str
+    components: str
+    linear: bool
+
+    @property
+    def name(self) -> str:
+        return self.source.capitalize()
+
+    @property
+    def macro(self) -> str:
+        return "PROBE" if self.source == "probes" else self.source.upper()
+
+    def texels(self, volume: VolumeData) -> F32:
+        if self.source == "probes":
+            return probe_texels(volume)
+        if self.source in CHAINS:
+            return volume_chain(volume, self.source)
+        # A map that the bundle left out is never looked at.
+        return volume.atlases[self.source].texels if self.source in volume.atlases else np.zeros((1, 1, 1, 2), np.float32)
+
+    def shape(self, volume: VolumeData) -> tuple[int, ...]:
+        return chain_shape(volume, self.source) if self.source in CHAINS else self.texels(volume).shape
+
+
+_DIFFUSE = (_Map("irradiance", "vec3", "rgb", True), _Map("visibility", "vec2", "rg", True), _Map("probes", "vec4", "rgba", False))
+_GLOSSY = (
+    _Map("distance", "float", "r", False),
+    _Map("normal", "vec3", "rgb", False),
+    _Map("nearest", "float", "r", False),
+    _Map("radiance", "vec3", "rgb", True),
+    _Map("gloss", "vec3", "rgb", True),
+)
+
+
+def _maps(volumes: Sequence[VolumeData]) -> tuple[_Map, ...]:
+    return _DIFFUSE + _GLOSSY if traceable(volumes) else _DIFFUSE
+
+
 def probe_textures(device: Device, volumes: Sequence[VolumeData]) -> list[Image]:
-    """Irradiance, visibility and the probe tables of all volumes."""
-    irradiance, visibility, probes = _texels(volumes)
-    # No device need offer textures of three channels.
-    rgba = [np.concatenate([t, np.zeros((*t.shape[:3], 1), np.float32)], -1) for t in irradiance]
-    stacks = (_stacked(rgba), _stacked(visibility), _stacked(probes))
-    return [texture(device, stack, linear=linear) for stack, linear in zip(stacks, (True, True, False), strict=True)]
+    """Irradiance, visibility and the probe tables of all volumes; and what rays are traced through, where they have it."""
+    return [texture(device, _stacked([_four(m.texels(v)) for v in volumes]), linear=m.linear) for m in _maps(volumes)]
 
 
 def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: ArrayLike = (0.0, 0.0, 0.0)) -> str:
@@ -39,31 +83,28 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
         World position of the zero of the shader's frame, metres.
     """
     lines = []
-    for i, (name, texels) in enumerate(zip(("Irradiance", "Visibility", "Probes"), _texels(volumes), strict=True)):
-        height, width = (max(t.shape[axis] for t in texels) for axis in (1, 2))
-        first = np.cumsum([0] + [len(t) for t in texels]).tolist()
-        lines.append(f"layout(set = 0, binding = {first_binding + i}) uniform sampler2DArray host{name};")
+    for i, m in enumerate(_maps(volumes)):
+        shapes = [m.shape(v) for v in volumes]
+        height, width = (max(shape[axis] for shape in shapes) for axis in (1, 2))
+        first = np.cumsum([0] + [shape[0] for shape in shapes]).tolist()
+        lines.append(f"layout(set = 0, binding = {first_binding + i}) uniform sampler2DArray host{m.name};")
         # How far a volume's layers reach across the texture's, and which is its first.
-        places = [f"vec3({t.shape[2] / width!r}, {t.shape[1] / height!r}, {layer}.0)" for t, layer in zip(texels, first, strict=False)]
+        places = [f"vec3({shape[2] / width!r}, {shape[1] / height!r}, {layer}.0)" for shape, layer in zip(shapes, first, strict=False)]
         choices = "".join(f" if (v == {v}) place = {place};" for v, place in enumerate(places) if v)
-        lines.append(f"vec3 place{name}(int v) {{ vec3 place = {places[0]};{choices} return place; }}")
-    for name, kind, swizzle in (("Irradiance", "vec3", "rgb"), ("Visibility", "vec2", "rg")):
-        look_up = f"textureLod(host{name}, vec3(p.xy * place.xy, p.z + place.z), 0.0).{swizzle}"
-        lines.append(f"{kind} read{name}(int v, vec3 p) {{ vec3 place = place{name}(v); return {look_up}; }}")
-    lines += [
-        "#define OB_IRRADIANCE(v, uvw) readIrradiance(v, uvw)",
-        "#define OB_VISIBILITY(v, uvw) readVisibility(v, uvw)",
-        "#define OB_PROBE(v, texel) texelFetch(hostProbes, texel + ivec3(0, 0, int(placeProbes(v).z)), 0)",
-    ]
-    return "\n".join(lines) + "\n" + module_source(bundle_constants(volumes, frame))
+        lines.append(f"vec3 place{m.name}(int v) {{ vec3 place = {places[0]};{choices} return place; }}")
+        if m.linear:
+            look_up = f"textureLod(host{m.name}, vec3(p.xy * place.xy, p.z + place.z), 0.0).{m.components}"
+            lines.append(f"{m.kind} read{m.name}(int v, vec3 p) {{ vec3 place = place{m.name}(v); return {look_up}; }}")
+        else:
+            look_up = f"texelFetch(host{m.name}, p + ivec3(0, 0, int(place{m.name}(v).z)), 0).{m.components}"
+            lines.append(f"{m.kind} read{m.name}(int v, ivec3 p) {{ return {look_up}; }}")
+        lines.append(f"#define OB_{m.macro}(v, at) read{m.name}(v, at)")
+    return "\n".join(lines) + "\n" + module_source(bundle_constants(volumes, frame), traced=traceable(volumes))
 
 
-def _texels(volumes: Sequence[VolumeData]) -> tuple[list[F32], list[F32], list[F32]]:
-    """Irradiance, visibility and probe tables, one array a volume."""
-    irradiance = [v.atlases["irradiance"].texels for v in volumes]
-    probes = [probe_texels(v) for v in volumes]
-    visibility = [v.atlases["visibility"].texels if "visibility" in v.atlases else np.zeros((1, 1, 1, 2), np.float32) for v in volumes]
-    return irradiance, visibility, probes
+def _four(texels: F32) -> F32:
+    """No device need offer textures of three channels."""
+    return np.concatenate([texels, np.zeros((*texels.shape[:3], 1), np.float32)], -1) if texels.shape[3] == 3 else texels
 
 
 def _stacked(parts: Sequence[F32]) -> F32:

@@ -10,16 +10,18 @@ from bake_core.errors import BakeError, MachineError
 from bake_core.shader_files import shader_dir
 
 
-def module_source(constants: str) -> str:
+def module_source(constants: str, *, traced: bool) -> str:
     """The whole module as one text, in include order, for hosts without ``#include``.
 
     Parameters
     ----------
     constants : str
         A bundle's constants.glsl.
+    traced : bool
+        With the part that traces rays, and the macros that it needs.
     """
-    octahedral, grid, irradiance = (shader_text(name) for name in SHADERS)
-    return "\n".join((octahedral, grid, constants, irradiance))
+    octahedral, grid, irradiance, trace = (shader_text(name) for name in SHADERS)
+    return "\n".join((octahedral, grid, constants, irradiance, *([trace] if traced else [])))
 
 
 def shader_text(name: str) -> str:

@@ -15,6 +15,7 @@ import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -132,6 +133,20 @@ class Blobs:
         if "sha256:" + hashlib.sha256(data).hexdigest() != digest:
             raise BakeError("blob.corrupt", "does not have the digest it was stored with", work_key(job, name))
         return data
+
+    def peek_work(self, job: str, name: str) -> bytes | None:
+        """What lies in a job's work folder under `name`, for a look at it; None where there is nothing."""
+        try:
+            return bytes(obstore.get(self._store, work_key(job, name)).bytes())
+        except FileNotFoundError:
+            return None
+
+    def remove_blob(self, digest: str) -> None:
+        """Remove a blob that no row names any more."""
+        with suppress(FileNotFoundError):
+            obstore.delete(self._store, blob_key(digest))
+        if self.root is None:
+            (self._local / blob_key(digest)).unlink(missing_ok=True)
 
     def remove_work(self, job: str) -> None:
         """Remove a job's work folder."""

@@ -45,6 +45,10 @@ class _Cancel(Exception):
     """The job's state has become `cancelling`."""
 
 
+class _Enough(Exception):
+    """The bake shall end with the passes it has."""
+
+
 class _Stop(Exception):
     """The service is going down; the job stays as it is, for the next start to find."""
 
@@ -66,10 +70,13 @@ class Driver:
     def __init__(self, job: Job, settings: Settings, store: Store, blobs: Blobs, compute: Compute, hub: Hub) -> None:
         self.job = job
         self._settings, self._store, self._blobs, self._compute, self._hub = settings, store, blobs, compute, hub
-        # Keys of futures that are done, messages of workers, and the two exceptions above: everything that a driver waits for.
+        # Keys of futures that are done, messages of workers, and the three exceptions above: everything that a driver waits for.
         self._inbox: queue.SimpleQueue[str | Message | type[Exception]] = queue.SimpleQueue()
         self._began = time.monotonic()
         self._seconds_before = 0.0
+        # A restart may have come between the request and its effect.
+        self._enough = job.stop_asked
+        self._tracing = False
         self._shown: dict[str, Any] | None = None
 
     # Called from other threads
@@ -81,6 +88,10 @@ class Driver:
     def cancel(self) -> None:
         """The job is `cancelling`."""
         self._inbox.put(_Cancel)
+
+    def finish(self) -> None:
+        """A bake shall end with the passes it has: the store has `stop_asked`. Too late while it is finalizing, and of no effect then."""
+        self._inbox.put(_Enough)
 
     def stop(self) -> None:
         """The service is going down."""
@@ -132,7 +143,8 @@ class Driver:
         clock = Clock(spec, self._show)
 
         clock.stage("building")
-        probes, threads = self._one(worker.prepare, work)
+        probes, threads, plan = self._one(worker.prepare, work)
+        self._store.set_plan(self.job.id, plan)
         self._move(State.RUNNING)
         clock.stage("compiling")
         self._one(worker.compile_kernels, work)
@@ -141,12 +153,21 @@ class Driver:
         if merged:
             clock.measured(merged[-1].last, merged[-1].error)
             run.stopped = decide(spec.stop, merged[-1].last, merged[-1].error, self._seconds_before)
+        if merged and run.stopped == "continue" and self._enough:
+            run.stopped = "interrupt"
         while run.stopped == "continue":
             following = opened.pop(0) if opened else self._open_pass(spec, merged, run, probes)
             if following is None:
                 run.stopped = "time"
                 break
-            done = self._trace(work, following, probes, merged[-1] if merged else None, clock)
+            self._tracing = True
+            try:
+                done = self._trace(work, following, probes, merged[-1] if merged else None, clock)
+            except _Enough:
+                run.stopped = "interrupt"
+                break
+            finally:
+                self._tracing = False
             merged.append(done)
             run.shards = done.shards
             run.curve.append(done.point)
@@ -212,7 +233,7 @@ class Driver:
         request = self.job.request
         baked = self._store.job(request["bake"])
         assert baked is not None and baked.result is not None, "a verification is accepted only of a bake that has succeeded"
-        work = self._work(baked)
+        work = replace(self._work(baked), memory_bytes=self.job.memory_bytes)
         self._move(State.RUNNING)
         made = self._one(worker.verify, work, baked.result["bundle"], request)
         self._move(State.FINALIZING)
@@ -227,9 +248,10 @@ class Driver:
     def _work(self, baked: Job) -> worker.Work:
         """What a worker is told of a bake's scene and spec."""
         scene = self._store.scene(baked.request["scene"])
-        assert scene is not None, "a bake is accepted only for a scene that is here, and none is ever removed"
+        assert scene is not None, "a job's scene stays as long as the job's files do"
         files = {key: scene[key] for key in ("root", "files")}
-        return worker.Work(self.job.id, self._blobs.url, files, baked.request["spec"], self._settings.threads, self._settings.cached_scenes)
+        s = self._settings
+        return worker.Work(self.job.id, self._blobs.url, files, baked.request["spec"], s.threads, s.cached_scenes, baked.memory_bytes)
 
     # Pieces of work
 
@@ -251,8 +273,11 @@ class Driver:
                 running[str(future.key)] = piece, future
                 future.add_done_callback(lambda done: self._inbox.put(str(done.key)))
             news = self._inbox.get()
+            if news is _Enough and not self._tracing:
+                self._enough = True
+                continue
             if isinstance(news, type):
-                self._halt(running, begun, wait=news is _Cancel)
+                self._halt(running, begun, wait=news is not _Stop)
                 raise news
             if isinstance(news, str):
                 if news not in running:

@@ -63,6 +63,18 @@ class Scheduler:
         if driver:
             driver.cancel()
 
+    def finish(self, job: str) -> None:
+        """A running bake shall end with the passes it has."""
+        with self._bell:
+            driver = self._drivers.get(job)
+        if driver:
+            driver.finish()
+
+    def drives(self, job: str) -> bool:
+        """Whether a driver is still at work on a job, if only to tidy up."""
+        with self._bell:
+            return job in self._drivers
+
     def close(self) -> None:
         """Stop the drivers, leave their jobs to the next start, and stop the workers."""
         self._stopping = True
@@ -103,7 +115,7 @@ class Scheduler:
             with self._bell:
                 self._drivers[job.id] = driver
                 self._threads.add(thread)
-            # A cancel may have come between the claim and the line above.
+            # A cancel may have come between the claim and the line above. (A stop cannot: it is taken of a running bake only.)
             if (now := self._store.job(job.id)) and now.state == "cancelling":
                 driver.cancel()
             self._hub.tell(job.id)

@@ -15,6 +15,18 @@ struct ObVolume {
     float visibilityFloor;  // least weight of a probe that is not visible, so that a point that no probe sees is not black
 };
 
+// What glossy light is traced through in a volume (trace.glsl); all 0 where the bundle has no such maps.
+struct ObLightField {
+    int distanceTexels;     // interior texels along the side of a tile
+    int normalTexels;
+    int radianceTexels;
+    int nearestLevels;      // of the chain "nearest"
+    int glossLevels;        // of the chain "gloss"
+    float glossAlpha;       // alpha of GGX that the first of them is blurred with; the last has 1
+    float texel;            // side of a distance texel of mean solid angle, radians
+    float miss;             // distance that stands for nothing
+};
+
 // The cell around a point: its lowest probe, and how far through the cell the point is.
 struct ObCell {
     ivec3 base;

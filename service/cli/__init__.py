@@ -18,6 +18,7 @@ COMMANDS = (
     "info",
     "sample",
     "verify",
+    "trace-check",
     "stability",
     "bench",
     "serve",
@@ -25,8 +26,10 @@ COMMANDS = (
     "wait",
     "status",
     "list",
+    "stop",
     "cancel",
     "fetch",
+    "token",
     "demo",
 )
 EXIT_CODES = "exit codes: 0 done; 2 bad input or usage; 3 failed; 4 out of budget before the target error; 5 a verification failed"
@@ -37,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(prog="octobake", description="Server-side global-illumination baking.", epilog=EXIT_CODES)
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        importlib.import_module(f"service.cli.{name}").add(commands)
+        importlib.import_module(f"service.cli.{name.replace('-', '_')}").add(commands)
     return top
 
 

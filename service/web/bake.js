@@ -1,7 +1,7 @@
 // One bake as it goes: its state, and each point of its curve as a pass ends. Everything the service says goes in through textContent.
 const id = decodeURIComponent(location.pathname.split("/").pop());
 const path = `/v1/bakes/${encodeURIComponent(id)}`;
-const FINISHED = ["succeeded", "failed", "cancelled"];
+const FINISHED = ["succeeded", "failed", "cancelled", "expired"];
 const place = (name) => document.getElementById(name);
 place("id").textContent = id;
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from service import driver
+from bake_core.errors import BakeError, Cancelled
+from service import driver, worker
 from service.driver import Driver
 from service.jobs import Kind
 from service.parts import Service
@@ -61,3 +65,27 @@ def test_a_task_that_begins_as_it_is_cancelled_is_stopped_too(
     with pytest.raises(driver._Cancel):
         it._one(len, "anything")
     assert compute.restarted == restarted
+
+
+@pytest.mark.parametrize(("limit", "over"), [(1, True), (None, False), (2**60, False)])
+def test_a_task_whose_process_comes_to_more_memory_than_it_may_is_stopped(limit: int | None, over: bool) -> None:
+    """A kernel sees its flag and gives up with a cancel; what the job is told is the reason."""
+    task: Any = SimpleNamespace(flag=np.zeros(1, np.uint8))
+    work = worker.Work("job", "file:///", {}, {}, 1, 1, limit)
+    watch = worker._Watch(task, work)
+
+    def kernel() -> None:
+        deadline = time.monotonic() + (20 * worker.WATCH_SECONDS if not over else 10.0)
+        while time.monotonic() < deadline:
+            if task.flag[0]:
+                raise Cancelled("bake.cancelled", "was cancelled")
+            time.sleep(0.001)
+
+    if not over:
+        with watch:
+            kernel()
+        return
+    worker._cache["another job's scene"] = SimpleNamespace()  # type: ignore[assignment]
+    with pytest.raises(BakeError) as caught, watch:
+        kernel()
+    assert caught.value.slug == "job.over_memory" and caught.value.where == "job job" and not worker._cache

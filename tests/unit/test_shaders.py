@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core import irradiance
+from bake_core import irradiance, light_field
 from bake_core.bundle import VolumeData
 from bake_core.octahedral import dir_to_oct, oct_to_dir
 from bake_core.probe_textures import probe_module, probe_textures
 from bake_core.shader_compiler import compile_glsl, shader_text
 from bake_core.vulkan import Bindings, Device, compute_pipeline, storage
 from tests import compile_shaders
-from tests.conformance import synthetic
+from tests.conformance import rooms, synthetic
+from tests.conformance.rooms import Room
 
 HEADER = """#version 450
 layout(local_size_x = 64) in;
@@ -35,6 +36,17 @@ void main() {
         int v = obSelectVolume(position);
         outputs[2 * i] = vec4(obIrradiance(position, normal, wo), float(v));
         outputs[2 * i + 1] = vec4(obIrradianceToward(position, normal, wo, -wo), 0.0);
+    }
+}
+"""
+TRACE = """
+void main() {
+    int i = int(gl_GlobalInvocationID.x);
+    if (i < count) {
+        ObTrace seen = obTraceRadiance(inputs[3 * i].xyz, inputs[3 * i + 1].xyz, inputs[3 * i + 2].x);
+        outputs[3 * i] = vec4(seen.radiance, seen.distance);
+        outputs[3 * i + 1] = vec4(seen.normal, float(seen.verdict));
+        outputs[3 * i + 2] = vec4(vec3(seen.probe), float(seen.volume));
     }
 }
 """
@@ -89,6 +101,33 @@ def test_the_irradiance_query_agrees_with_the_fixtures() -> None:
     found = query(synthetic.volumes(), columns["position"], columns["normal"], columns["wo"])[:, 0]
     np.testing.assert_array_equal(found[:, 3], columns["volume"])
     np.testing.assert_allclose(found[:, :3], columns["irradiance"], atol=4e-5)
+
+
+@pytest.mark.parametrize(("n", "normals", "light"), [(64, 64, 16), (18, 12, 8)])
+def test_tracing_agrees_with_its_numpy_twin(n: int, normals: int, light: int) -> None:
+    """Two volumes, probes off their lattice and inside boxes, maps of different resolutions, a roof that is open."""
+    room = Room(solids=(((-1.2, 0.0, -1.0), (-0.3, 1.7, -0.2)), ((0.4, 0.0, 0.3), (1.1, 0.8, 1.3))), open_top=True)
+    fine = rooms.volume(room, (-0.2, 0.3, -1.4), (0.5, 0.5, 0.5), (3, 5, 6), n=n, normals=normals, light=light, moved=0.3)
+    coarse = rooms.volume(room, (-1.5, 0.5, -1.5), (1.0, 1.0, 1.0), (4, 3, 4), n=n, normals=normals, light=light, moved=0.2, name="coarse")
+    volumes = (fine, coarse)
+    o, d = rooms.rays(room, 20000, seed=3)
+    expected = light_field.trace(light_field.light_field(volumes), o, d)
+    for roughness in (0.0, 0.35, 0.9):
+        found = run(HEADER + probe_module(volumes, 2) + TRACE, [o, d, np.full_like(o, roughness)], 3, volumes)
+        same = found[:, 1, 3] == expected.verdict
+        # A ray along an edge goes to one side of it in float32 and to the other in float64.
+        assert same.mean() > 0.9995
+        assert (found[:, 2, 3] == expected.volume).mean() > 0.998
+        hit = same & (expected.verdict == light_field.HIT) & np.isclose(found[:, 0, 3], expected.distance, rtol=0, atol=1e-4)
+        assert hit.sum() > 0.9995 * (same & (expected.verdict == light_field.HIT)).sum()
+        np.testing.assert_allclose(found[hit, 1, :3], expected.normal[hit], atol=1e-6)
+        light_there = light_field.arriving(volumes, expected, o, d, roughness)
+        counts = np.array([v.counts for v in volumes])[found[:, 2, 3].astype(int)]
+        probe = (found[:, 2, :3] * np.stack([np.ones(len(o)), counts[:, 0], counts[:, 0] * counts[:, 1]], -1)).sum(-1)
+        alike = (hit | (same & (expected.verdict == light_field.MISS))) & (probe == expected.probe)
+        assert alike.mean() > 0.9
+        np.testing.assert_allclose(found[alike, 0, :3], light_there[alike], atol=2e-3)
+        assert np.isfinite(found[:, 0, :3]).all()
 
 
 def test_one_volume_is_enough() -> None:

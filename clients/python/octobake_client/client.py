@@ -34,16 +34,25 @@ class Client:
     patience : float
         How long, in seconds, :meth:`wait`, :meth:`events` and :meth:`fetch` go on trying when the connection breaks, as it does when
         the service is restarted.
+    token : str, optional
+        What ``octobake token create`` printed; none is needed where the service listens on loopback only.
     transport : httpx.BaseTransport, optional
         In place of the network.
     """
 
     def __init__(
-        self, base_url: str, *, timeout: float = 60.0, patience: float = 30.0, transport: httpx.BaseTransport | None = None
+        self,
+        base_url: str,
+        *,
+        timeout: float = 60.0,
+        patience: float = 30.0,
+        token: str | None = None,
+        transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.patience = patience
+        headers = {"User-Agent": "octobake-client", **({"Authorization": f"Bearer {token}"} if token else {})}
         try:
-            self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers={"User-Agent": "octobake-client"})
+            self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers=headers)
         except httpx.InvalidURL as e:
             raise OctobakeClientError("client.bad_url", f"is not a URL: {e}", base_url) from None
 
@@ -82,10 +91,13 @@ class Client:
 
     # Jobs
 
-    def submit(self, scene: str, spec: Mapping[str, Any], *, labels: Mapping[str, str] | None = None, priority: int = 0) -> Bake:
-        """Queue a bake of the scene with this digest."""
+    def submit(
+        self, scene: str, spec: Mapping[str, Any], *, labels: Mapping[str, str] | None = None, priority: int = 0, fresh: bool = False
+    ) -> Bake:
+        """Queue a bake of the scene with this digest; one that was made of the same before is the answer, unless it shall be `fresh`."""
         body = {"scene": scene, "spec": dict(spec), "labels": dict(labels or {}), "priority": priority}
-        return Bake.of(self._send("POST", PATHS[Bake], json=body).json())
+        headers = {"Cache-Control": "no-cache"} if fresh else {}
+        return Bake.of(self._send("POST", PATHS[Bake], json=body, headers=headers).json())
 
     def verify(self, bake: Bake | str, *, labels: Mapping[str, str] | None = None, priority: int = 0, **options: Any) -> Verification:
         """Queue a verification of a finished bake; `options` are the request's further keys (see the OpenAPI document)."""
@@ -116,6 +128,10 @@ class Client:
         """Ask for a job's end; answers it as it stands then."""
         return type(job).of(self._send("POST", f"{PATHS[type(job)]}/{job.id}:cancel").json())
 
+    def stop(self, bake: Bake) -> Bake:
+        """End a running bake with the passes it has; answers it as it stands then."""
+        return Bake.of(self._send("POST", f"{PATHS[Bake]}/{bake.id}:stop").json())
+
     def events(self, job: Job, after: int = 0) -> Iterator[Event]:
         """A job's events from the first after `after` until it has finished, across broken connections."""
         url = f"{PATHS[type(job)]}/{job.id}/events"
@@ -144,12 +160,18 @@ class Client:
 
         `point` is told every point of a bake's curve, those first that there are already; `progress` only the latest.
         """
-        for event in self.events(job):
-            if event.type == "progress" and progress:
-                progress(Progress.of(event.document))
-            if event.type == "pass" and point:
-                point(Point.of(event.document))
-        return self._job(type(job), job.id)
+        last = 0
+        while True:
+            for event in self.events(job, last):
+                last = event.id or last
+                if event.type == "progress" and progress:
+                    progress(Progress.of(event.document))
+                if event.type == "pass" and point:
+                    point(Point.of(event.document))
+            now = self._job(type(job), job.id)
+            # One that was queued again has finished before, and goes on.
+            if now.done:
+                return now
 
     # Downloads
 
