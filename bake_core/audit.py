@@ -386,7 +386,7 @@ def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _L
     some = slice(0, estimates.shape[1])
     probes, texels, unit = probes[some], texels[some], np.stack([limits[some], limits[some] ** 2], -1)
     stored = _stored(baked.volumes, "visibility", probes, texels) / unit
-    intended = baked.state.visibility[probes].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
+    intended = baked.state.visibility[probes, ..., :2].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
     mean = float(np.sqrt((stored**2).sum(-1)).mean())
     return _figures(stored, intended, estimates / unit, np.zeros(len(probes)), mean, probes, paths)
 

@@ -6,7 +6,7 @@ else is float64, so differences from GLSL are GLSL's rounding (tests hold them t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -138,10 +138,35 @@ def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
 
 def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64, toward: F64) -> tuple[F64, F64, I64]:
     """Mirrors ``obIrradianceInVolume``: irradiance, weights and probes; `table` is the volume's probe table, one row a probe."""
-    n = len(positions)
-    base, fraction = cell(volume, positions)
     normal_bias, view_bias = surface_bias(volume)
     biased = positions + normals * normal_bias + wo * view_bias
+
+    def weigh(tile: I64, probe: F64) -> F64:
+        return crush(facing(probe - positions, normals) * _visibility(volume, tile, biased - probe))
+
+    return blend(volume, table, positions, toward, weigh)
+
+
+def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Callable[[I64, F64], F64]) -> tuple[F64, F64, I64]:
+    """Irradiance of the eight probes around points, by trilinear weights times others.
+
+    Parameters
+    ----------
+    table : (n, 4) float64
+        The volume's probe table.
+    positions, toward : (m, 3) float64
+    weigh : callable
+        Of tiles (m,) and of where their probes stand (m, 3) the other weights, (m,).
+
+    Returns
+    -------
+    irradiance : (m, 3) float64
+    weights : (m, 8) float64
+        Of the corners; they sum to 1, or are all 0.
+    probes : (m, 8) int64
+    """
+    n = len(positions)
+    base, fraction = cell(volume, positions)
     oct_toward = dir_to_oct(toward)
     probes = np.empty((n, 8), np.int64)
     trilinear, other, light = np.empty((n, 8)), np.empty((n, 8)), np.empty((n, 8, 3))
@@ -149,13 +174,11 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
         upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
         lattice = np.minimum(base + upper, volume.counts - 1)
         probe = lattice @ np.array([1, volume.counts[0], volume.counts[0] * volume.counts[1]])
-        position = volume.origin + volume.spacing * lattice + table[probe, :3]
         kept = table[probe, 3] > 0
         # A probe without a tile reads the first one, and counts for nothing.
         tile = np.where(kept, table[probe, 3] - 1, 0).astype(np.int64)
-        weight = _facing(position - positions, normals) * _visibility(volume, tile, biased - position)
         probes[:, corner] = probe
-        other[:, corner] = _crush(weight) * kept
+        other[:, corner] = weigh(tile, volume.origin + volume.spacing * lattice + table[probe, :3]) * kept
         trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
         light[:, corner] = bilinear(volume.atlases["irradiance"], tile, oct_toward)
     weights = trilinear * other
@@ -196,7 +219,7 @@ def bilinear(atlas: Atlas, tile: I64, oct_xy: NDArray[np.floating]) -> F64:
     return out
 
 
-def _facing(to_probe: F64, normals: F64) -> F64:
+def facing(to_probe: F64, normals: F64) -> F64:
     """Mirrors ``obFacing``."""
     wrap = 0.5 + 0.5 * (to_probe * normals).sum(-1) / np.maximum(np.linalg.norm(to_probe, axis=-1), 1e-20)
     out: F64 = wrap * wrap + FACING_FLOOR
@@ -206,19 +229,19 @@ def _facing(to_probe: F64, normals: F64) -> F64:
 def _visibility(volume: VolumeData, tile: I64, from_probe: F64) -> F64:
     """Mirrors ``obVisibility``."""
     out = np.ones(len(tile))
-    r = np.minimum(np.linalg.norm(from_probe, axis=-1), volume.distance_limit)
-    atlas = volume.atlases.get("visibility")
+    r = np.linalg.norm(from_probe, axis=-1)
+    atlas = volume.atlases.get("walls")
     if atlas is None:
         return out
     apart = np.flatnonzero(r > 0)
-    mean, square = bilinear(atlas, tile[apart], dir_to_oct(from_probe[apart])).T
-    beyond = r[apart] - mean
-    variance = np.maximum(square - mean * mean, 1e-5 * square)
-    bound = variance / np.maximum(variance + beyond * beyond, 1e-37)
-    out[apart] = np.where(beyond > 0, np.maximum(bound**3, volume.parameters["visibility_floor"]), 1)
+    reach = np.abs(from_probe[apart]).sum(-1) * np.minimum(1, volume.distance_limit / r[apart]) / volume.spacing.min()
+    behind = bilinear(atlas, tile[apart], dir_to_oct(from_probe[apart]))[:, 0] * reach - 1
+    soft = volume.parameters["visibility_softness"] ** 2
+    bound = soft / (soft + behind * behind)
+    out[apart] = np.where(behind > 0, np.maximum(bound**3, volume.parameters["visibility_floor"]), 1)
     return out
 
 
-def _crush(weight: F64) -> F64:
+def crush(weight: F64) -> F64:
     """Mirrors ``obCrush``."""
     return np.where(weight < CRUSH_THRESHOLD, weight**3 / CRUSH_THRESHOLD**2, weight)

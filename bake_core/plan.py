@@ -116,7 +116,8 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     """Trace probes spread evenly through the bake."""
     n = prepared.probe_count
     chosen = np.unique(np.linspace(0, n - 1, min(_PILOT_PROBES, n)).astype(int))
-    few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen])
+    positions, limits, units = (a[chosen] for a in (prepared.positions, prepared.limits, prepared.units))
+    few = replace(prepared, positions=positions, limits=limits, units=units)
     state, given, seconds = empty_state(few), Allocation.start(len(chosen)), []
     for samples in ((0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)):
         started = time.perf_counter()

@@ -20,11 +20,11 @@ F32 = NDArray[np.float32]
 
 
 def probe_textures(device: Device, volumes: Sequence[VolumeData]) -> list[Image]:
-    """Irradiance, visibility and the probe tables of all volumes."""
-    irradiance, visibility, probes = _texels(volumes)
+    """Irradiance, walls and the probe tables of all volumes."""
+    irradiance, walls, probes = _texels(volumes)
     # No device need offer textures of three channels.
     rgba = [np.concatenate([t, np.zeros((*t.shape[:3], 1), np.float32)], -1) for t in irradiance]
-    stacks = (_stacked(rgba), _stacked(visibility), _stacked(probes))
+    stacks = (_stacked(rgba), _stacked(walls), _stacked(probes))
     return [texture(device, stack, linear=linear) for stack, linear in zip(stacks, (True, True, False), strict=True)]
 
 
@@ -39,7 +39,7 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
         World position of the zero of the shader's frame, metres.
     """
     lines = []
-    for i, (name, texels) in enumerate(zip(("Irradiance", "Visibility", "Probes"), _texels(volumes), strict=True)):
+    for i, (name, texels) in enumerate(zip(("Irradiance", "Walls", "Probes"), _texels(volumes), strict=True)):
         height, width = (max(t.shape[axis] for t in texels) for axis in (1, 2))
         first = np.cumsum([0] + [len(t) for t in texels]).tolist()
         lines.append(f"layout(set = 0, binding = {first_binding + i}) uniform sampler2DArray host{name};")
@@ -47,23 +47,23 @@ def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: Array
         places = [f"vec3({t.shape[2] / width!r}, {t.shape[1] / height!r}, {layer}.0)" for t, layer in zip(texels, first, strict=False)]
         choices = "".join(f" if (v == {v}) place = {place};" for v, place in enumerate(places) if v)
         lines.append(f"vec3 place{name}(int v) {{ vec3 place = {places[0]};{choices} return place; }}")
-    for name, kind, swizzle in (("Irradiance", "vec3", "rgb"), ("Visibility", "vec2", "rg")):
+    for name, kind, swizzle in (("Irradiance", "vec3", "rgb"), ("Walls", "float", "r")):
         look_up = f"textureLod(host{name}, vec3(p.xy * place.xy, p.z + place.z), 0.0).{swizzle}"
         lines.append(f"{kind} read{name}(int v, vec3 p) {{ vec3 place = place{name}(v); return {look_up}; }}")
     lines += [
         "#define OB_IRRADIANCE(v, uvw) readIrradiance(v, uvw)",
-        "#define OB_VISIBILITY(v, uvw) readVisibility(v, uvw)",
+        "#define OB_WALLS(v, uvw) readWalls(v, uvw)",
         "#define OB_PROBE(v, texel) texelFetch(hostProbes, texel + ivec3(0, 0, int(placeProbes(v).z)), 0)",
     ]
     return "\n".join(lines) + "\n" + module_source(bundle_constants(volumes, frame))
 
 
 def _texels(volumes: Sequence[VolumeData]) -> tuple[list[F32], list[F32], list[F32]]:
-    """Irradiance, visibility and probe tables, one array a volume."""
+    """Irradiance, walls and probe tables, one array a volume."""
     irradiance = [v.atlases["irradiance"].texels for v in volumes]
     probes = [probe_texels(v) for v in volumes]
-    visibility = [v.atlases["visibility"].texels if "visibility" in v.atlases else np.zeros((1, 1, 1, 2), np.float32) for v in volumes]
-    return irradiance, visibility, probes
+    walls = [v.atlases["walls"].texels if "walls" in v.atlases else np.zeros((1, 1, 1, 1), np.float32) for v in volumes]
+    return irradiance, walls, probes
 
 
 def _stacked(parts: Sequence[F32]) -> F32:

@@ -93,10 +93,12 @@ def _volume(volume: VolumeData, frame: NDArray[np.float64]) -> str:
         _vector("ivec3", map(str, volume.counts)),
         _vector("ivec2", map(str, tiles)),
         str(texels.get("irradiance", 0)),
-        str(texels.get("visibility", 0)),
+        str(texels.get("walls", 0)),
+        _float(volume.spacing.min()),
         _float(volume.distance_limit),
         _float(normal_bias),
         _float(view_bias),
+        _float(volume.parameters["visibility_softness"]),
         _float(volume.parameters["visibility_floor"]),
     ]
     return _vector("ObVolume", fields)

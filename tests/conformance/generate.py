@@ -90,6 +90,7 @@ def _volume(volume: VolumeData) -> dict[str, Any]:
         "distance_limit": rounded(volume.distance_limit),
         "normal_bias": rounded(normal_bias),
         "view_bias": rounded(view_bias),
+        "visibility_softness": rounded(volume.parameters["visibility_softness"]),
         "visibility_floor": rounded(volume.parameters["visibility_floor"]),
         "probes": {"shape": list(probes.shape), "texels": rounded(probes.ravel())},
         "atlases": atlases,

@@ -33,7 +33,9 @@ def volume_of(row: dict[str, Any]) -> VolumeData:
     counts = np.asarray(row["counts"])
     spacing = np.asarray(row["spacing"])
     several = spacing[counts > 1].min()
-    parameters = {"bias_scale": 1 / several} | {k: row.get(k, 0.0) for k in ("normal_bias", "view_bias", "visibility_floor")}
+    parameters = {"bias_scale": 1 / several} | {
+        k: row.get(k, 0.0) for k in ("normal_bias", "view_bias", "visibility_softness", "visibility_floor")
+    }
     return VolumeData(
         name="",
         origin=np.asarray(row["origin"]),

@@ -367,7 +367,7 @@ def test_all_outputs(tmp_path: Path) -> None:
         tmp_path, glb, {**spec, "outputs": everything, "resolution": small, "stop": {"target_error": None, "max_samples": 16}}
     )
     bundle = read_bundle(tmp_path / "out")
-    assert list(bundle.volumes[0].atlases) == everything
+    assert list(bundle.volumes[0].atlases) == [*everything, "walls"]
     assert not any("bytes" in x for x in result.manifest["left_out"])
     described = {a["output"]: a for a in result.manifest["volumes"][0]["atlases"]}
     assert [described[o]["interior"] for o in everything] == [4, 8, 16, 32, 16]
@@ -397,7 +397,8 @@ def test_one_output_alone(tmp_path: Path) -> None:
     for output in ("irradiance", "visibility", "radiance", "distance", "normal"):
         chosen = {**spec, "outputs": [output], "stop": {"target_error": None, "max_samples": 4}}
         manifest = bake_into(tmp_path, glb, chosen, output).manifest
-        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output]
+        walls = ["walls"] if output == "visibility" else []
+        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output, *walls]
         assert {x["what"] for x in manifest["left_out"] if "bytes" in x} == {
             "irradiance",
             "visibility",

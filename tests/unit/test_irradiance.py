@@ -24,7 +24,7 @@ def filled(volume: VolumeData, output: str, texels: np.ndarray) -> VolumeData:
 def in_the_open(counts: tuple[int, int, int] = (3, 3, 3), n: int = 8) -> VolumeData:
     """Spacing 1, every probe sees everything."""
     volume = synthetic.volume("open", (0, 0, 0), (1, 1, 1), counts, n=n)
-    return filled(volume, "visibility", np.array([volume.distance_limit, volume.distance_limit**2]))
+    return filled(volume, "walls", np.array([0.0]))
 
 
 def test_the_same_light_everywhere_is_answered_everywhere() -> None:
@@ -38,7 +38,7 @@ def test_the_same_light_everywhere_is_answered_everywhere() -> None:
 
 
 def test_at_a_probe_the_answer_is_the_probes_own() -> None:
-    """Whatever its neighbours hold, and although visibility says that it is not seen."""
+    """Whatever its neighbours hold, and although its walls say that it is not seen."""
     volume = synthetic.volume("v", (-1, 2, 5), (0.5, 2, 1), (3, 4, 2), seed=4)
     index = np.stack(np.unravel_index(np.arange(24), (2, 4, 3))[::-1], -1)
     found = irradiance.sample((volume,), volume.origin + volume.spacing * index, np.tile([0.0, 0.6, 0.8], (24, 1)))
@@ -65,7 +65,7 @@ def test_a_wall_between_probes_keeps_the_other_sides_light_out() -> None:
     cosine = np.maximum(side[..., 0] * towards[..., 0], 1e-6)
     distance = np.minimum(0.5 / cosine, volume.distance_limit)
     volume = filled(volume, "irradiance", lit)
-    volume = filled(volume, "visibility", np.stack([distance, distance**2], -1))
+    volume = filled(volume, "walls", 1 / (distance * np.abs(towards).sum(-1))[..., None])
     leaked = irradiance.sample((volume,), [[0.499, 0.5, 0.5]], [[-1.0, 0.0, 0.0]]).irradiance[0, 0]
     assert 0 < leaked < 1e-4
     away = irradiance.sample(
@@ -111,13 +111,11 @@ def test_where_volumes_overlap_the_first_answers() -> None:
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
 def test_the_answer_does_not_depend_on_the_unit_of_length(scale: float) -> None:
     volume = synthetic.volume("v", (-1, 0, 0), (1, 1, 1), (3, 3, 3), seed=5)
-    moments = volume.atlases["visibility"]
     scaled = replace(
         volume,
         origin=volume.origin * scale,
         spacing=volume.spacing * scale,
         distance_limit=volume.distance_limit * scale,
-        atlases={**volume.atlases, "visibility": replace(moments, texels=(moments.texels * [scale, scale * scale]).astype(np.float32))},
     )
     positions = np.stack([synthetic.sequence(100, k * 100) for k in range(3)], -1) * 2 - [1, 0, 0]
     normals = np.tile([0.36, 0.48, 0.8], (100, 1))
