@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.octahedral import dir_to_oct
-from bake_core.shader_constants import probe_texels, surface_bias
+from bake_core.shader_constants import finest_first, probe_texels, surface_bias
 
 if TYPE_CHECKING:
     from bake_core.bundle import Atlas, VolumeData
@@ -37,17 +37,21 @@ class Samples:
     ----------
     irradiance : (n, 3) float64
         E, no 1/π inside; everything but the direct light of punctual and directional lights.
-    weights : (n, 8) float64
-        Of the probes around each point; they sum to 1, or are all 0 where every probe is inside geometry.
-    probes : (n, 8) int64
-        Flat indices of those probes within the volume. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
+    weights : (n, 8 k) float64
+        Of the probes around each point, eight for each of the volumes that answer, k being the most that do for any point. They sum to 1,
+        or to less where every probe of a volume is inside geometry.
+    probes : (n, 8 k) int64
+        Flat indices of those probes within their volumes. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
+    volumes : (n, 8 k) int64
+        Indices of their volumes.
     volume : (n,) int64
-        Index of the volume that answered.
+        Index of the finest volume around each point; of the nearest one where none is.
     """
 
     irradiance: F64
     weights: F64
     probes: I64
+    volumes: I64
     volume: I64
 
 
@@ -72,30 +76,58 @@ def sample(
     positions = np.asarray(positions, np.float64).reshape(-1, 3)
     normals = np.asarray(normals, np.float64).reshape(-1, 3)
     wo, toward = (normals if d is None else np.asarray(d, np.float64).reshape(-1, 3) for d in (wo, toward))
-    chosen = select_volume(volumes, positions)
-    out = Samples(np.zeros((len(positions), 3)), np.zeros((len(positions), 8)), np.zeros((len(positions), 8), np.int64), chosen)
-    for v, volume in enumerate(volumes):
+    n, chosen, shares = len(positions), select_volume(volumes, positions), volume_shares(volumes, positions)
+    # One at least: there may be no points.
+    k = int((shares > 0).sum(0).max(initial=1))
+    weights, probes, owners = np.zeros((n, k, 8)), np.zeros((n, k, 8), np.int64), np.repeat(chosen, 8 * k).reshape(n, k, 8)
+    irradiance, slot = np.zeros((n, 3)), np.zeros(n, np.int64)
+    for v in finest_first(volumes):
+        volume = volumes[v]
         table = probe_texels(volume).reshape(-1, 4).astype(np.float64)
-        of_volume = np.flatnonzero(chosen == v)
+        of_volume = np.flatnonzero(shares[v] > 0)
         for first in range(0, len(of_volume), CHUNK):
             at = of_volume[first : first + CHUNK]
-            out.irradiance[at], out.weights[at], out.probes[at] = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
+            light, part, around = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
+            irradiance[at] += shares[v, at, None] * light
+            weights[at, slot[at]], probes[at, slot[at]], owners[at, slot[at]] = shares[v, at, None] * part, around, v
+        slot[of_volume] += 1
+    return Samples(irradiance, weights.reshape(n, -1), probes.reshape(n, -1), owners.reshape(n, -1), chosen)
+
+
+def volume_shares(volumes: Sequence[VolumeData], positions: F64) -> F64:
+    """How much each volume's answer counts at each point, (volumes, n) float64; they sum to 1. Mirrors the loop of ``obIrradianceToward``.
+
+    A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the
+    rest to the next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest
+    has.
+    """
+    shares, rest = np.zeros((len(volumes), len(positions))), np.ones(len(positions))
+    nearest = select_volume(volumes, positions)
+    for v in finest_first(volumes):
+        volume = volumes[v]
+        beyond = (_beyond(volume, positions) / (0.5 * volume.spacing)).max(-1)
+        # So little for the nearest counts only where it is alone.
+        reach = np.maximum(1 - np.minimum(beyond, 1), np.where(nearest == v, 1e-20, 0))
+        shares[v] = rest * reach
+        rest = rest * (1 - reach)
+    out: F64 = shares / shares.sum(0)
     return out
 
 
 def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
-    """Index of the first volume that contains each point, the nearest one where none does. Mirrors ``obSelectVolume``.
-
-    An axis with one probe reaches half a spacing to both sides.
-    """
-    squared = np.empty((len(volumes), len(positions)))
-    for v, volume in enumerate(volumes):
-        margin = np.where(volume.counts == 1, 0.5, 0.0) * volume.spacing
-        p = positions - volume.origin
-        d = np.maximum(np.maximum(-margin - p, p - (volume.counts - 1) * volume.spacing - margin), 0)
-        squared[v] = (d * d).sum(-1)
-    nearest: I64 = squared.argmin(0).astype(np.int64)
+    """Index of the finest volume that contains each point, of the nearest one where none does. Mirrors ``obSelectVolume``."""
+    order = np.array(finest_first(volumes), np.int64)
+    squared = np.stack([(_beyond(volumes[v], positions) ** 2).sum(-1) for v in order])
+    nearest: I64 = order[squared.argmin(0)]
     return nearest
+
+
+def _beyond(volume: VolumeData, positions: F64) -> F64:
+    """How far outside of a volume's box points are along each axis, (n, 3); an axis with one probe reaches half a spacing to both sides."""
+    margin = np.where(volume.counts == 1, 0.5, 0.0) * volume.spacing
+    p = positions - volume.origin
+    out: F64 = np.maximum(np.maximum(-margin - p, p - (volume.counts - 1) * volume.spacing - margin), 0)
+    return out
 
 
 def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.bool_]:

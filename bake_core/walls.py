@@ -1,10 +1,10 @@
 """Walls: where the nearest surfaces are, so that a bilinear look-up gives a flat one back. By this the query tells light from leaks.
 
 A point of a surface at distance d in the unit direction ω is s = d·|ω|₁ times a point v of the octahedron |x| + |y| + |z| = 1, and v is
-linear in the square's coordinates on each of the eight faces. On a plane n·p = h, s·(n·v) = h: so 1/s is linear in the square, whatever the plane,
-and a bilinear look-up of 1/s between four texels has no error at all where one of distances (or of their moments: Donnelly and Lauritzen
-2006, "Variance Shadow Maps") is off by more the more slanting the view. Lengths are in units of the volume's smallest spacing, so that half
-floats hold them at any scale.
+linear in the square's coordinates on each of the eight faces. On a plane n·p = h, s·(n·v) = h: so 1/s is linear in the square, whatever the
+plane, and a bilinear look-up of 1/s between four texels has no error at all where one of distances (or of their moments: Donnelly and
+Lauritzen 2006, "Variance Shadow Maps") is off by more the more slanting the view. Lengths are in units of the volume's smallest spacing,
+so that half floats hold them at any scale.
 
 Texels are those whose look-ups fit all rays best in the mean square: across a fold of the octahedron, where v has a kink, they share out
 what the value at each texel's centre would leave to one side.

@@ -31,13 +31,12 @@ ObCell obCell(ObVolume volume, vec3 position) {
     return ObCell(ivec3(base), g - base);
 }
 
-// Squared distance from a point to a volume's box, 0 inside. An axis with one probe reaches half a spacing to both sides.
-float obDistanceSquared(ObVolume volume, vec3 position) {
+// How far outside of a volume's box a point is along each axis, 0 inside. An axis with one probe reaches half a spacing to both sides.
+vec3 obBeyond(ObVolume volume, vec3 position) {
     vec3 last = vec3(volume.counts - 1);
     vec3 margin = vec3(equal(volume.counts, ivec3(1))) * 0.5 * volume.spacing;
     vec3 p = position - volume.origin;
-    vec3 d = max(max(-margin - p, p - last * volume.spacing - margin), vec3(0.0));
-    return dot(d, d);
+    return max(max(-margin - p, p - last * volume.spacing - margin), vec3(0.0));
 }
 
 // Flat index of probe (i, j, k): i + nx * (j + ny * k).

@@ -72,12 +72,14 @@ vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 towar
     return chosen.w > 0.0 ? chosen.xyz / chosen.w : vec3(0.0);
 }
 
-// The first volume that contains a point, in the order of the spec; the nearest one where none does.
+// The finest volume that contains a point; the nearest one where none does.
 int obSelectVolume(vec3 position) {
     int nearest = 0;
     float least = 3.4e38;
-    for (int v = 0; v < OB_VOLUMES; ++v) {
-        float d = obDistanceSquared(obVolume(v), position);
+    for (int rank = 0; rank < OB_VOLUMES; ++rank) {
+        int v = obFinest(rank);
+        vec3 beyond = obBeyond(obVolume(v), position);
+        float d = dot(beyond, beyond);
         if (d < least) {
             least = d;
             nearest = v;
@@ -91,12 +93,30 @@ int obSelectVolume(vec3 position) {
 //   position  the point, in the frame of constants.glsl
 //   normal    unit shading normal, on the side that is seen
 //   wo        unit, from the point to the viewer; the normal itself where there is none
-vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
-    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, normal);
+//   toward    unit, the way that the plane faces on which light arrives: the normal, but for lobes that are not about it
+// A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the rest to the
+// next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest has.
+vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
+    int nearest = obSelectVolume(position);
+    vec4 sum = vec4(0.0);
+    float rest = 1.0;
+    for (int rank = 0; rank < OB_VOLUMES; ++rank) {
+        int v = obFinest(rank);
+        ObVolume volume = obVolume(v);
+        vec3 beyond = obBeyond(volume, position) / (0.5 * volume.spacing);
+        // So little for the nearest counts only where it is alone.
+        float reach = max(1.0 - min(max(beyond.x, max(beyond.y, beyond.z)), 1.0), v == nearest ? 1e-20 : 0.0);
+        if (reach > 0.0) {
+            sum += rest * reach * vec4(obIrradianceInVolume(v, position, normal, wo, toward), 1.0);
+            rest *= 1.0 - reach;
+        }
+        if (rest == 0.0) {
+            break;
+        }
+    }
+    return sum.xyz / sum.w;
 }
 
-// The same through the point, but on a plane that faces another way: for lobes that are not about the normal.
-//   toward    unit, any direction
-vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
-    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, toward);
+vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
+    return obIrradianceToward(position, normal, wo, normal);
 }

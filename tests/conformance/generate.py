@@ -64,8 +64,8 @@ def query() -> dict[str, Any]:
     volumes = synthetic.volumes()
     positions, normals, wo = synthetic.points(80)
     answer = irradiance.sample(volumes, positions, normals, wo)
-    rows = zip(positions, normals, wo, answer.irradiance, answer.volume, answer.probes, answer.weights, strict=True)
-    keys = ("position", "normal", "wo", "irradiance", "volume", "probes", "weights")
+    rows = zip(positions, normals, wo, answer.irradiance, answer.volume, answer.volumes, answer.probes, answer.weights, strict=True)
+    keys = ("position", "normal", "wo", "irradiance", "volume", "volumes", "probes", "weights")
     return {
         "constants.glsl": bundle_constants(volumes).splitlines(),
         "volumes": [_volume(v) for v in volumes],

@@ -77,6 +77,7 @@ def test_irradiance_query() -> None:
     columns = {k: np.array([row[k] for row in data["queries"]]) for k in data["queries"][0]}
     found = irradiance.sample(volumes, columns["position"], columns["normal"], columns["wo"])
     np.testing.assert_array_equal(found.volume, columns["volume"])
+    np.testing.assert_array_equal(found.volumes, columns["volumes"])
     np.testing.assert_array_equal(found.probes, columns["probes"])
     np.testing.assert_allclose(found.weights, columns["weights"], atol=1e-6)
     np.testing.assert_allclose(found.irradiance, columns["irradiance"], atol=1e-6)

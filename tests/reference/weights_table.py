@@ -48,11 +48,8 @@ PATHS = 1024
 def bytes_of(volumes: Volumes) -> int:
     """What a renderer holds for a probe: irradiance and walls with their borders, and its row of the probe table."""
     sizes = {"half": 2, "float": 4}
-    atlases = volumes[0].atlases
-    return (
-        sum(atlases[name].tile ** 2 * atlases[name].texels.shape[-1] * sizes[atlases[name].encoding] for name in ("irradiance", "walls"))
-        + 16
-    )
+    held = [volumes[0].atlases[name] for name in ("irradiance", "walls")]
+    return 16 + sum(a.tile**2 * int(a.texels.shape[-1]) * sizes[a.encoding] for a in held)
 
 
 def ours(volumes: Volumes) -> Callable[[F64, F64], F64]:
