@@ -31,18 +31,24 @@ from bake_core.volume_chains import CHAINS, chain_levels, chain_size, traceable,
 
 F32 = NDArray[np.float32]
 
-# Majercik et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production": the surface bias is
-# (n · 0.2 + wo · 0.8) · 0.75 · spacing · 0.3; 0.05 is the least a probe's visibility weighs, so that a cell is never left without light.
+# A point is moved by (n · normal_bias + wo · view_bias) · bias_scale · spacing before the walls are looked up: the surface bias of Majercik
+# et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production". Theirs, 0.2, 0.8 and 0.225, was chosen for
+# moments, which blur a wall by more. What moves a point towards the viewer moves it along a wall, and from beside a thin one to behind it:
+# with a bias of 0.18 towards a grazing view, 1.6 % of the light came through 2 cm; with none, nothing does (docs/leaks.md).
+# `visibility_softness` is over what part of the distance a shadow of the walls fades: none would be a line, and half floats place a wall
+# to 0.0005. Its tail falls as the sixth power, so where no probe sees a point, as in a corner that maps round off, the least hidden one
+# answers. `visibility_floor` is where the tail ends, so that it is above what float32 holds when it has been cubed by the crush.
 PARAMETERS = {
-    "normal_bias": 0.2,
-    "view_bias": 0.8,
-    "bias_scale": 0.225,
-    "visibility_floor": 0.05,
+    "normal_bias": 0.15,
+    "view_bias": 0.0,
+    "bias_scale": 1.0,
+    "visibility_floor": 1e-9,
+    "visibility_softness": 0.01,
     "visibility_sharpness": float(VISIBILITY_SHARPNESS),
 }
 # Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
 # flat-wall variances come out negative). Distances are metres of any scale.
-_ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
+_ALWAYS_FULL = ("visibility", "distance")
 
 _BYTES = {"half": 2, "float": 4}
 # As many as anybody would go and look at.
@@ -179,7 +185,9 @@ def _volume(
 ) -> tuple[dict[str, Any], VolumeData]:
     """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
     kept = np.flatnonzero(active[probes])
-    maps = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
+    maps: dict[str, F32] = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
+    if "visibility" in maps:
+        maps["visibility"], maps["walls"] = maps["visibility"][..., :2], maps["visibility"][..., 2:]
     tiles = [m.shape[1] + 2 for m in maps.values()]
     shape = layout(volume.counts, max(tiles), len(kept))
     atlases: dict[str, Atlas] = {}

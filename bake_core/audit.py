@@ -394,7 +394,7 @@ def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _L
     some = slice(0, estimates.shape[1])
     probes, texels, unit = probes[some], texels[some], np.stack([limits[some], limits[some] ** 2], -1)
     stored = _stored(baked.volumes, "visibility", probes, texels) / unit
-    intended = baked.state.visibility[probes].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
+    intended = baked.state.visibility[probes, ..., :2].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
     mean = float(np.sqrt((stored**2).sum(-1)).mean())
     return _figures(stored, intended, estimates / unit, np.zeros(len(probes)), mean, probes, paths)
 
@@ -414,7 +414,7 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
     estimates, paths = look.at(len(receivers), trace)
     n = estimates.shape[1]
     answers = sample(baked.volumes, receivers.positions[:n], receivers.normals[:n])
-    scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volume, answers.probes, answers.weights)
+    scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volumes, answers.probes, answers.weights)
     mean = float(np.sqrt((answers.irradiance**2).sum(-1)).mean())
     if baked.state.samples < SCRAMBLES:
         return _figures(answers.irradiance, answers.irradiance, estimates, None, mean, answers.probes[:, 0], paths), None
@@ -428,7 +428,7 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
 def _answers_of_scrambles(baked: Baked, normals: F64, volumes: I64, probes: I64, weights: F64) -> F64:
     """(n, SCRAMBLES, 3): what the query would answer from each scramble alone; it is linear in irradiance, its weights know none of it."""
     first = np.cumsum([0] + [len(v.states) for v in baked.volumes])
-    touched, index = np.unique(probes + first[volumes][:, None], return_inverse=True)
+    touched, index = np.unique(probes + first[volumes], return_inverse=True)
     index = index.reshape(probes.shape)
     side = baked.volumes[0].atlases["irradiance"].interior
     means = baked.state.scramble_means(touched)

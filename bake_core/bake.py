@@ -47,6 +47,7 @@ from bake_core.spec import Spec
 from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
 from bake_core.unneeded import unneeded
+from bake_core.walls import walls
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64
@@ -60,8 +61,8 @@ class Prepared:
     ----------
     positions : (n, 3) float64
         Of all probes of all volumes in turn, local frame.
-    limits : (n,) float64
-        Each probe's distance limit, metres.
+    limits, units : (n,) float64
+        Each probe's distance limit, and the smallest spacing of its volume, metres.
     needed : (n,) bool
         Which of them are baked at all, unless they turn out to stand inside a solid.
     tracer : Tracer
@@ -78,6 +79,7 @@ class Prepared:
     whole: Tracer
     positions: NDArray[np.float64]
     limits: NDArray[np.float64]
+    units: NDArray[np.float64]
     needed: NDArray[np.bool_]
 
     @property
@@ -117,6 +119,7 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
         whole=whole,
         positions=positions,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
+        units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
         needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
     )
 
@@ -156,7 +159,7 @@ def empty_state(prepared: Prepared) -> State:
             needed=prepared.needed.copy(),
             irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3), np.float32),
             radiance=np.zeros((n, HALVES, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0, 0), np.float32),
-            visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
+            visibility=np.zeros((n, s.visibility, s.visibility, 3) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
             backface=np.zeros(n, np.float32),
             distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
             normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
@@ -205,7 +208,7 @@ def trace_shard(
     looked = 0
     if samples[0] == 0:
         needed = prepared.needed[slice(*probes)]
-        seen, looked = _see(prepared, positions[needed], prepared.limits[slice(*probes)][needed], threads, flag)
+        seen, looked = _see(prepared, probes[0] + np.flatnonzero(needed), threads, flag)
         free = outside(seen["backface"])
         seen = {name: values if name == "backface" else values[free] for name, values in seen.items()}
         seen["backface"], kept = _spread(seen["backface"], needed), _spread(free, needed)
@@ -272,10 +275,11 @@ def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint
 
 
 def _see(
-    prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], threads: int, flag: NDArray[np.uint8]
+    prepared: Prepared, probes: NDArray[np.int64], threads: int, flag: NDArray[np.uint8]
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
     """Distances and what is made of them, a few probes at a time on each thread; and how many rays they took."""
     s = prepared.selection
+    positions, limits, units = (np.ascontiguousarray(a[probes]) for a in (prepared.positions, prepared.limits, prepared.units))
     solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
 
     def look(first: int) -> tuple[dict[str, NDArray[np.float32]], int]:
@@ -284,7 +288,8 @@ def _see(
         # One row at a time: a matrix product's bits may depend on how many rows it has.
         seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
         if s.keeps("visibility"):
-            seen["visibility"] = visibility_moments(distance, limits[chunk], s.visibility)
+            moments = visibility_moments(distance, limits[chunk], s.visibility)
+            seen["visibility"] = np.concatenate([moments, walls(distance, limits[chunk], units[chunk], s.visibility)], -1)
         if s.keeps("distance"):
             seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
         if s.keeps("normal"):

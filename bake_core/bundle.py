@@ -35,7 +35,7 @@ class Atlas:
     Attributes
     ----------
     output : str
-        ``irradiance``, ``visibility``, ``radiance``, ``distance`` or ``normal``.
+        ``irradiance``, ``visibility``, ``walls``, ``radiance``, ``distance`` or ``normal``.
     texels : (layers, rows * tile, columns * tile, channels) float32
     tile, interior : int
         Texels along a tile's side with its border (interior + 2) and without.
@@ -120,6 +120,7 @@ MANIFEST = "manifest.json"
 CHANNELS = {
     "irradiance": ("R", "G", "B"),
     "visibility": ("mean", "square"),
+    "walls": ("inverse",),
     "radiance": ("R", "G", "B"),
     "distance": ("distance",),
     "normal": ("x", "y", "z"),

@@ -230,7 +230,8 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     # Every so-many-th would be a diagonal through the grid.
     within = np.random.default_rng(prepared.spec.seed).random(count)
     chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
-    few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen], needed=prepared.needed[chosen])
+    part = {name: getattr(prepared, name)[chosen] for name in ("positions", "limits", "units", "needed")}
+    few = replace(prepared, **part)
     state, start = empty_state(few), Allocation.start(count)
     first, second = (0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)
     # No sample at all: distances alone.

@@ -18,8 +18,9 @@ from bake_core.spec import OUTPUTS, OutputName, Spec
 
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
 _CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
-# Of a texel as it is usually stored: halves of three colours, floats of two moments, one float, halves of a vector.
-_TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 8, "radiance": 6, "distance": 4, "normal": 6}
+# Of a texel as it is usually stored: halves of three colours, floats of two moments and half a float of the walls, one float, halves of a
+# vector.
+_TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 10, "radiance": 6, "distance": 4, "normal": 6}
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ class Tally(Stored):
         Sums.
     radiance : (k, HALVES, capture texels, 3) float32
         Sums, or (0, 0, 0, 0).
-    visibility : (k, v, v, 2) float32
-        Moments; of the first pass only, else (0, 0, 0, 0). So are the next three.
+    visibility : (k, v, v, 3) float32
+        Moments, and walls; of the first pass only, else (0, 0, 0, 0). So are the next three.
     backface : (p,) float32
     distance : (k, d²) float32 or (0, 0)
     normal : (k, n², 3) float32 or (0, 0, 0)

@@ -175,7 +175,7 @@ def test_the_reader_on_the_page_reads_a_bundle(baked: Bundle) -> None:
     manifest, tiles = names["read"](baked.path)
     assert manifest == baked.manifest
     volume = baked.volumes[0]
-    assert {output for _, output in tiles} == set(volume.atlases) and len(tiles) == 5
+    assert {output for _, output in tiles} == set(volume.atlases) and len(tiles) == 6
     for output, atlas in volume.atlases.items():
         found = tiles["room", output]
         assert found.shape == (12, atlas.tile, atlas.tile, atlas.texels.shape[-1])

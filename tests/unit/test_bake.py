@@ -367,7 +367,7 @@ def test_all_outputs(tmp_path: Path) -> None:
         tmp_path, glb, {**spec, "outputs": everything, "resolution": small, "stop": {"target_error": None, "max_samples": 16}}
     )
     bundle = read_bundle(tmp_path / "out")
-    assert list(bundle.volumes[0].atlases) == everything
+    assert list(bundle.volumes[0].atlases) == [*everything, "walls"]
     assert (tmp_path / "out" / "report.html").read_text().count("irradiance.exr") == 1
     assert not any("bytes" in x for x in result.manifest["left_out"])
     described = {a["output"]: a for a in result.manifest["volumes"][0]["atlases"]}
@@ -398,7 +398,8 @@ def test_one_output_alone(tmp_path: Path) -> None:
     for output in ("irradiance", "visibility", "radiance", "distance", "normal"):
         chosen = {**spec, "outputs": [output], "stop": {"target_error": None, "max_samples": 4}}
         manifest = bake_into(tmp_path, glb, chosen, output).manifest
-        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output]
+        walls = ["walls"] if output == "visibility" else []
+        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output, *walls]
         assert {x["what"] for x in manifest["left_out"] if "bytes" in x} == {
             "irradiance",
             "visibility",
