@@ -33,8 +33,8 @@ from tests.service.running import Server, box_spec, free_port, living, octobake
 
 # Jobs differ in their seed and so in their bytes: a mix-up would show.
 SEEDS = 4
-# Some 2 s of work in some 20 shards, so that few jobs end without a kill.
-SAMPLES, PROBES, SHARD_SECONDS = 256, (4, 4, 4), 0.1
+# Some seconds of work in some tens of shards, so that many jobs meet a kill.
+SAMPLES, PROBES, SHARD_SECONDS = 64, (4, 4, 4), 0.1
 CLIENTS = 3
 # Of jobs that clients cancel, and of requests that they send a second time under the same key.
 CANCELLED, REPEATED = 0.15, 0.3
