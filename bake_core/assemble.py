@@ -59,6 +59,7 @@ def assemble(
     scene: Scene,
     spec: Spec,
     volumes: tuple[Volume, ...],
+    offsets: F32,
     selection: Selection,
     left_out: tuple[LeftOut, ...],
     state: State,
@@ -69,6 +70,8 @@ def assemble(
 
     Parameters
     ----------
+    offsets : (n, 3) float32
+        Of all volumes' probes in turn from their lattice points, metres.
     left_out : tuple of LeftOut
         Outputs and all else.
 
@@ -87,7 +90,9 @@ def assemble(
     first = 0
     for index, volume in enumerate(volumes):
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto")
+        entry, content = _volume(
+            volume, offsets[probes], selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto"
+        )
         entries.append(entry)
         data.append(content)
         size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
@@ -174,6 +179,7 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 def _volume(
     volume: Volume,
+    offsets: F32,
     outputs: tuple[OutputName, ...],
     selection: Selection,
     state: State,
@@ -230,7 +236,7 @@ def _volume(
         spacing=volume.spacing,
         counts=np.asarray(volume.counts, np.int64),
         states=states,
-        offsets=np.zeros((volume.probe_count, 3), np.float32),
+        offsets=offsets,
         backface=state.backface[probes],
         parameters=PARAMETERS,
         distance_limit=volume.distance_limit,
@@ -252,7 +258,7 @@ def _volume(
             "count": volume.probe_count,
             "active": len(kept),
             "states": states.tolist(),
-            "offsets": None,
+            "offsets": [[float(str(x)) for x in offset] for offset in offsets] if offsets.any() else None,
             # Shortest decimals of the float32 values.
             "backface": [float(str(b)) for b in state.backface[probes]],
         },
