@@ -14,6 +14,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -54,6 +55,11 @@ def bytes_of(volumes: Volumes) -> int:
 
 def ours(volumes: Volumes) -> Callable[[F64, F64], F64]:
     return lambda positions, normals: sample(volumes, positions, normals).irradiance
+
+
+def with_parameters(volumes: Volumes, bias: float, fade: float) -> Volumes:
+    changed = {"normal_bias": bias, "visibility_softness": fade}
+    return tuple(replace(v, parameters={**v.parameters, **changed}) for v in volumes)
 
 
 def grazing(volumes: Volumes) -> Callable[[F64, F64], F64]:
@@ -114,6 +120,8 @@ def compare(name: str, samples: int) -> None:
         gains = [least / f.relmse for f, _ in list(rows.values())[3:] if f.relmse]
         noise = rows["octobake"][0].reference_noise
         print(f"{name}: {len(receivers)} receivers, noise {noise:.1g}; best of 25 over octobake: {', '.join(f'{g:.2f}' for g in gains)}")
+        others = [figures(ours(with_parameters(mine, bias, fade))).relmse or 0 for bias in (0.1, 0.15, 0.2) for fade in (0.01, 0.02, 0.05)]
+        print(f"  octobake with biases from 0.1 to 0.2 and fades from 1 % to 5 %: relMSE from {min(others):.4f} to {max(others):.4f}")
         for way, (f, size) in rows.items():
             print(
                 f"  {way:32s} {size:5d} B  relMSE {f.relmse:8.4f}  95th percentile {f.p95:6.3f}  mean ratio {f.mean_ratio:6.3f}", flush=True

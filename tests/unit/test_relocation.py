@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def test_nobody_goes_far_or_through_anything(tmp_path: Path) -> None:
     """In the Cornell box, boxes and all: within 0.45 of a spacing, as active as before, and the bundle says where they stand."""
     glb, document = cornell()
     grid = {**document["volumes"][0], "spacing": [0.5] * 3, "counts": [4, 4, 4]}
-    kept = {"volumes": [grid], "stop": {"target_error": None, "max_samples": 4}, "outputs": ["irradiance", "visibility"]}
+    kept: dict[str, Any] = {"volumes": [grid], "stop": {"target_error": None, "max_samples": 4}, "outputs": ["irradiance", "visibility"]}
     still = bake_example(tmp_path, (glb, document), **kept).volumes[0]
     bundle = bake_example(tmp_path, (glb, document), **kept, probes="relocated")
     (volume,) = bundle.volumes
