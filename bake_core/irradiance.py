@@ -92,7 +92,7 @@ def sample(
             irradiance[at] += shares[v, at, None] * light
             weights[at, slot[at]], probes[at, slot[at]], owners[at, slot[at]] = shares[v, at, None] * part, around, v
         slot[of_volume] += 1
-    return Samples(irradiance, weights.reshape(n, -1), probes.reshape(n, -1), owners.reshape(n, -1), chosen)
+    return Samples(irradiance, weights.reshape(n, 8 * k), probes.reshape(n, 8 * k), owners.reshape(n, 8 * k), chosen)
 
 
 def volume_shares(volumes: Sequence[VolumeData], positions: F64) -> F64:

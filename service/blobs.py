@@ -14,21 +14,41 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import AsyncIterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
 
 import obstore
+from obstore.exceptions import BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
-from bake_core.errors import BakeError, InputError
+from bake_core.errors import BakeError, InputError, OctobakeError
 
 DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 # Large enough that the thread hop per chunk does not matter, small enough that 500 downloads fit in memory.
 CHUNK = 256 * 1024
+
+
+class StoreError(BakeError):
+    """The blob store could not be read or written: it is full, or out of reach. Another try may find it well."""
+
+
+@contextmanager
+def store_errors(where: str) -> Iterator[None]:
+    """Tell what the operating system and the store's library raise as a :class:`StoreError` with slug ``blob.store_failed``."""
+    try:
+        yield
+    except (OSError, BaseError) as e:
+        text = f"the blob store cannot be used ({type(e).__name__}: {e}); see to its room and its network, and requeue the job"
+        raise StoreError("blob.store_failed", text, where) from e
+    except OctobakeError as e:
+        if e.slug not in ("bake.cannot_write", "machine.cannot_write"):
+            raise
+        # The core's words for the same.
+        raise StoreError(e.slug, e.message, e.where) from e
 
 
 def blob_key(digest: str) -> str:

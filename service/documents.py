@@ -335,6 +335,7 @@ class Cleanup(BaseModel):
     """What a clean-up takes, or would take now."""
 
     jobs: list[str] = Field(description="Ids of jobs that expire: their files go.")
+    forgotten: list[str] = Field(description="Ids of jobs that expired long ago: their figures and events go, too.")
     scenes: list[Digest]
     blobs: int
     bytes: int

@@ -16,6 +16,7 @@ from typing import Any
 
 from distributed import Future, KilledWorker
 from distributed.client import FutureCancelledError
+from sqlalchemy.exc import OperationalError
 
 from bake_core import bake
 from bake_core.clock import Clock
@@ -25,7 +26,7 @@ from bake_core.progress import Progress
 from bake_core.report import Run
 from bake_core.spec import Spec, parse_spec
 from service import worker
-from service.blobs import Blobs
+from service.blobs import Blobs, StoreError
 from service.compute import Compute, Message
 from service.hub import Hub
 from service.jobs import IllegalTransition, Job, Kind, Pass, State
@@ -37,6 +38,8 @@ log = logging.getLogger("octobake.driver")
 # A task that has not ended this long after its cancel is in native code that polls no flag (building, compiling, Vulkan): its worker is
 # killed, so that the CPU is free within the second that is promised, on a busy machine too.
 STOP_SECONDS = 0.3
+# Between tries of a piece that the blob store has failed: nine minutes in all, after which the job fails.
+STORE_PAUSES = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
 # Before the first shard has been timed: paths a second on one thread, on the slow side, so that first shards are rather short.
 FIRST_GUESS_RATE = 200_000.0
 
@@ -55,13 +58,17 @@ class _Stop(Exception):
 
 @dataclass
 class _Piece:
-    """One call of a worker function; how far its caller has heard that it is, and how many workers it has cost."""
+    """One call of a worker function.
+
+    `told` is how far its caller has heard that it is, `lost` how many workers it has cost, `refused` how often the blob store failed it.
+    """
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     done: Callable[[Any], None]
     told: float = 0.0
     lost: int = 0
+    refused: int = 0
 
 
 class Driver:
@@ -100,7 +107,13 @@ class Driver:
     # The job
 
     def run(self) -> None:
-        """Drive the job; returns when it has finished, or when the service stops. Never raises."""
+        """Drive the job; returns when it has finished, or when the service stops.
+
+        Raises
+        ------
+        OperationalError
+            The job store cannot be written, so there is no saying what became of the job; its committed work is safe.
+        """
         job = self.job.id
         try:
             if self.job.kind == Kind.BAKE:
@@ -114,6 +127,8 @@ class Driver:
             self._store.move(job, State.CANCELLED)
         except OctobakeError as e:
             self._fail(e)
+        except OperationalError:
+            raise
         except Exception as e:
             log.exception("job %s", job)
             self._fail(BakeError("bake.internal", f"{type(e).__name__}: {e}", f"job {job}"))
@@ -266,13 +281,18 @@ class Driver:
         waiting = deque(pieces)
         running: dict[str, tuple[_Piece, Future[Any]]] = {}
         begun: dict[str, str] = {}
+        held_until = 0.0
         while waiting or running:
-            while waiting and len(running) < self._compute.slots:
+            held = max(0.0, held_until - time.monotonic())
+            while waiting and not held and len(running) < self._compute.slots:
                 piece = waiting.popleft()
                 future = self._compute.submit(piece.function, *piece.arguments)
                 running[str(future.key)] = piece, future
                 future.add_done_callback(lambda done: self._inbox.put(str(done.key)))
-            news = self._inbox.get()
+            try:
+                news = self._inbox.get(timeout=held or None)
+            except queue.Empty:
+                continue
             if news is _Enough and not self._tracing:
                 self._enough = True
                 continue
@@ -287,6 +307,9 @@ class Driver:
                     piece.done(future.result())
                 except (KilledWorker, FutureCancelledError) as e:
                     self._lost(piece, type(e).__name__)
+                    waiting.appendleft(piece)
+                except StoreError as e:
+                    held_until = time.monotonic() + self._refused(piece, e)
                     waiting.appendleft(piece)
                 else:
                     advance(max(0.0, 1.0 - piece.told))
@@ -331,6 +354,15 @@ class Driver:
         if piece.lost >= self._settings.max_attempts:
             text = f"its worker died {piece.lost} times at {piece.function.__name__}; look for what this scene does to memory"
             raise BakeError("bake.crashed", text, f"job {self.job.id}")
+
+    def _refused(self, piece: _Piece, error: StoreError) -> float:
+        """The blob store failed a piece: how many seconds to leave it in peace."""
+        if piece.refused == len(STORE_PAUSES):
+            raise error
+        pause = STORE_PAUSES[piece.refused]
+        piece.refused += 1
+        log.warning("job %s: %s; trying again in %g s", self.job.id, error, pause)
+        return pause
 
     def _seconds(self) -> float:
         """Since the bake began, without the time that it lay in the queue after a restart."""

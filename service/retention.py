@@ -1,6 +1,6 @@
 """What is kept, and for how long: files of finished jobs, scenes and uploads go when their time is up and nobody needs them.
 
-A clean-up and its preview are one computation. Jobs' rows, their events and their figures stay.
+A clean-up and its preview are one computation. Jobs' rows, their events and their figures stay for a longer time of their own.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ DAY = 86400.0
 
 @dataclass(frozen=True)
 class Cleanup:
-    """What a clean-up takes: ids of the jobs that expire, digests of scenes, and digest to size of blobs."""
+    """What a clean-up takes: ids of jobs that expire, and of those that are forgotten; digests of scenes; digest to size of blobs."""
 
     jobs: tuple[str, ...]
+    forgotten: tuple[str, ...]
     scenes: tuple[str, ...]
     blobs: dict[str, int]
 
@@ -40,7 +41,7 @@ class Retention:
     """Cleans up every hour, and when it is told to."""
 
     def __init__(self, settings: Settings, store: Store, files: Blobs) -> None:
-        self._seconds = settings.retention_days * DAY
+        self._seconds, self._history_seconds = settings.retention_days * DAY, settings.history_days * DAY
         self._store, self._files = store, files
         # One clean-up at a time.
         self._lock = threading.Lock()
@@ -65,6 +66,7 @@ class Retention:
         with self._lock:
             with reading(self._store.engine) as c:
                 found, used = self._find(c)
+            forgotten = tuple(job for job in found.forgotten if self._store.forget(job))
             expired = tuple(job for job in found.jobs if self._store.expire(job))
             gone = tuple(digest for digest in found.scenes if self._remove_scene(digest, used[digest]))
             kept = set(found.scenes) - set(gone)
@@ -73,14 +75,15 @@ class Retention:
                 with reading(self._store.engine) as c:
                     found, used = self._find(c)
             sizes = {digest: size for digest, size in found.blobs.items() if self._remove_blob(digest, used[digest])}
-        return Cleanup(expired, gone, sizes)
+        return Cleanup(expired, forgotten, gone, sizes)
 
     def _loop(self) -> None:
         while not self._stopping.is_set():
             try:
                 taken = self.clean()
-                if taken.jobs or taken.blobs:
-                    log.info("%d jobs expired, %d files and %d scenes removed", len(taken.jobs), len(taken.blobs), len(taken.scenes))
+                counted = [len(x) for x in (taken.jobs, taken.forgotten, taken.blobs, taken.scenes)]
+                if any(counted):
+                    log.info("%d jobs expired, %d forgotten; %d files and %d scenes removed", *counted)
             except Exception:
                 log.exception("a clean-up failed; the next one goes on")
             self._stopping.wait(CLEAN_SECONDS)
@@ -96,6 +99,8 @@ class Retention:
         waiting = {row.request["bake"] for row in rows.values() if row.kind == Kind.VERIFICATION and row.state not in FINISHED}
         over = [job for job in over if job not in waiting]
         past -= waiting
+        long_past = now - self._history_seconds if self._history_seconds else float("-inf")
+        forgotten = [job for job in past if rows[job].state == State.EXPIRED and rows[job].finished <= long_past]
         needed = {digest for job, row in rows.items() if job not in past for digest in _needs(row)}
         needed |= {digest for job in waiting for digest in _needs(rows[job])}
         made = {digest for job in past for digest in _results(rows[job])}
@@ -112,7 +117,7 @@ class Retention:
             if row.digest not in needed and (row.used < cutoff or row.digest in made):
                 sizes[row.digest] = row.size
                 last_used[row.digest] = row.used
-        return Cleanup(tuple(over), tuple(old_scenes), sizes), last_used
+        return Cleanup(tuple(over), tuple(sorted(forgotten)), tuple(old_scenes), sizes), last_used
 
     def _is_over(self, row: Any, now: float) -> bool:
         ttl = self._seconds or None if row.ttl is None else row.ttl

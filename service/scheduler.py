@@ -31,6 +31,8 @@ class Scheduler:
         self._compute: Compute | None = None
         self._drivers: dict[str, Driver] = {}
         self._threads: set[threading.Thread] = set()
+        # Jobs whose driver could not even say how it ended, because the store failed it.
+        self._orphans: set[str] = set()
         self._bell = threading.Condition()
         self._rung = False
         self._stopping = False
@@ -109,6 +111,10 @@ class Scheduler:
 
     def _fill(self) -> None:
         assert self._compute
+        for orphan in list(self._orphans):
+            self._store.take_up(orphan)
+            self._orphans.discard(orphan)
+            self._hub.tell(orphan)
         while not self._stopping and len(self._drivers) < self._compute.slots and (job := self._store.claim()):
             driver = Driver(job, self._settings, self._store, self._blobs, self._compute, self._hub)
             thread = threading.Thread(target=self._drive, args=(driver,), name=f"octobake-job-{job.id}", daemon=True)
@@ -125,8 +131,9 @@ class Scheduler:
         try:
             driver.run()
         except Exception:
-            # The store itself failed (a full disk, a lost database): the job stays where it is until a restart reconciles it.
-            log.exception("job %s is left as it stands", driver.job.id)
+            # The store itself failed (a full disk, a lost database): the job goes back to the queue as soon as the store takes it.
+            log.exception("job %s has lost its driver; it is queued again when the store can be written", driver.job.id)
+            self._orphans.add(driver.job.id)
         with self._bell:
             del self._drivers[driver.job.id]
             self._threads.discard(threading.current_thread())

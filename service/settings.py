@@ -14,7 +14,7 @@ ENVIRONMENT_PREFIX = "OCTOBAKE_"
 # What the client's commands read.
 CLIENT_VARIABLES = ("OCTOBAKE_SERVER", "OCTOBAKE_TOKEN")
 # Where 0 means: choose for me, never, or no.
-MAY_BE_ZERO = ("port", "threads", "require_token", "retention_days", "webhook_private")
+MAY_BE_ZERO = ("port", "threads", "require_token", "retention_days", "history_days", "webhook_private")
 
 
 def _setting(default: str | int | float, text: str) -> Any:
@@ -48,6 +48,9 @@ class Settings:
     max_listeners: int = _setting(1000, "Event streams at once.")
     retention_days: float = _setting(
         30.0, "Files of a finished job and uploads that nobody asks for are kept so long; 0 keeps them for ever."
+    )
+    history_days: float = _setting(
+        365.0, "Rows of expired jobs, their figures and their events are kept so long after their end; 0: for ever."
     )
     webhook_secret: str = _setting("", "Signs webhooks: whsec_ and base64; default one made at the first start, in the data folder.")
     webhook_private: int = _setting(0, "1 lets webhooks go to private addresses and to this machine.")

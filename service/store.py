@@ -17,7 +17,7 @@ from sqlalchemy.engine import Connection, Row
 
 from service import outbox
 from service.jobs import FINISHED, REPEATABLE, TRANSITIONS, Attempt, Event, IllegalTransition, Job, Kind, Pass, Shard, State
-from service.tables import attempts, blobs, events, idempotency_keys, jobs, open_engine, passes, reading, scenes, shards, writing
+from service.tables import attempts, blobs, events, idempotency_keys, jobs, metadata, open_engine, passes, reading, scenes, shards, writing
 
 # Being asked for changes a blob's row no oftener than this; the shortest time that anything is kept is longer.
 USED_SECONDS = 60.0
@@ -263,6 +263,17 @@ class Store:
             _move(c, job, State.EXPIRED)
             return True
 
+    def forget(self, job: str) -> bool:
+        """Remove every row of a job that has expired; False where somebody has queued it again."""
+        with self._write() as c:
+            if _job(c, job, lock=True).state != State.EXPIRED:
+                return False
+            for table in reversed(metadata.sorted_tables):
+                if "job" in table.c:
+                    c.execute(sa.delete(table).where(table.c.job == job))
+            c.execute(sa.delete(jobs).where(jobs.c.id == job))
+            return True
+
     def set_plan(self, job: str, plan: Mapping[str, Any]) -> None:
         """Record what a job will bake."""
         with self._write() as c:
@@ -293,7 +304,14 @@ class Store:
             c.execute(sa.delete(idempotency_keys).where(idempotency_keys.c.job.is_(None)))
             under_way = sa.select(jobs.c.id, jobs.c.state).where(jobs.c.state.not_in([State.QUEUED, *FINISHED])).order_by(jobs.c.sequence)
             for row in c.execute(under_way).all():
-                _move(c, row.id, State.CANCELLED if row.state == State.CANCELLING else State.QUEUED)
+                _move(c, row.id, _left_behind(row.state))
+
+    def take_up(self, job: str) -> None:
+        """As :meth:`reconcile`, for a job whose driver has ended before its time."""
+        with self._write() as c:
+            state = _job(c, job, lock=True).state
+            if state not in (State.QUEUED, *FINISHED):
+                _move(c, job, _left_behind(state))
 
     # Passes and shards
 
@@ -376,6 +394,11 @@ def _move(c: Connection, job: str, state: State, **columns: Any) -> Job:
     if ended and after.webhook is not None:
         outbox.add(c, after, now)
     return after
+
+
+def _left_behind(state: str) -> State:
+    """What becomes of a job under way that nobody drives."""
+    return State.CANCELLED if state == State.CANCELLING else State.QUEUED
 
 
 def _begin_attempt(c: Connection, job: str, now: float) -> None:

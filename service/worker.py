@@ -35,7 +35,7 @@ from bake_core.report import Run
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
-from service.blobs import Blobs
+from service.blobs import Blobs, store_errors
 from service.scenes import find_stored, load_stored
 
 TOPIC = "octobake"
@@ -239,7 +239,7 @@ def _task(work: Work) -> Iterator[_Task]:
     task.tell(began=True)
     watch = _Watch(task, work)
     try:
-        with watch:
+        with watch, store_errors(f"job {work.job}"):
             yield task
     finally:
         task.tell(ended=True)

@@ -26,4 +26,10 @@ def clean_up(service: Here) -> documents.Cleanup:
 
 
 def _document(taken: retention.Cleanup) -> documents.Cleanup:
-    return documents.Cleanup(jobs=list(taken.jobs), scenes=list(taken.scenes), blobs=len(taken.blobs), bytes=sum(taken.blobs.values()))
+    return documents.Cleanup(
+        jobs=list(taken.jobs),
+        forgotten=list(taken.forgotten),
+        scenes=list(taken.scenes),
+        blobs=len(taken.blobs),
+        bytes=sum(taken.blobs.values()),
+    )

@@ -8,6 +8,7 @@ from collections import OrderedDict
 
 from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
+from starlette.requests import cookie_parser
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.parts import Service
@@ -17,6 +18,8 @@ from service.tokens import Token
 
 # Addresses whose last second is remembered: what one more costs is a few hundred bytes.
 REMEMBERED = 10_000
+# Where web pages keep the token that they were given.
+COOKIE = "octobake_token"
 # Who asks without a token, where none is needed.
 NOBODY = "-"
 
@@ -88,23 +91,22 @@ class Guard:
         try:
             needed = needed_scope(method, path)
             if needed is not None:
-                given = Headers(scope=scope).get("authorization")
-                if given is not None:
-                    token = await run_in_threadpool(_find, service, given)
-                    if token is None:
-                        await refuse(401, "request.bad_token", "this token is none of this service's", {"WWW-Authenticate": "Bearer"})
-                        return
-                    name = token.name
-                    if needed not in token.scopes and TokenScope.ADMIN not in token.scopes:
-                        headers = {"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{needed}"'}
-                        await refuse(
-                            403, "request.forbidden", f"the token {name} is not good for this: it takes the scope {needed}", headers
-                        )
-                        return
-                elif not self._open_to_all:
+                given, shown = _given(scope, method)
+                token = await run_in_threadpool(_find, service, given) if given is not None else None
+                if token is None and shown:
+                    await refuse(401, "request.bad_token", "this token is none of this service's", {"WWW-Authenticate": "Bearer"})
+                    return
+                if token is None and not self._open_to_all:
                     text = "send a token as Authorization: Bearer ...; `octobake token create` makes one"
                     await refuse(401, "request.no_token", text, {"WWW-Authenticate": "Bearer"})
                     return
+                if token is not None:
+                    name = token.name
+                    if needed not in token.scopes and TokenScope.ADMIN not in token.scopes:
+                        text = f"the token {name} is not good for this: it takes the scope {needed}"
+                        headers = {"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{needed}"'}
+                        await refuse(403, "request.forbidden", text, headers)
+                        return
             scope["octobake.owner"] = name
 
             async def written(message: Message) -> None:
@@ -137,6 +139,19 @@ class _Rates:
         while len(self._buckets) > REMEMBERED:
             self._buckets.popitem(last=False)
         return 0.0 if left >= 1 else (1 - left) / self.rate
+
+
+def _given(scope: Scope, method: str) -> tuple[str | None, bool]:
+    """What a request says of who asks, and whether its sender chose to say so.
+
+    A browser sends the pages' cookie by itself, an outlived one too, and where another site's page makes it: so nothing is changed by it.
+    """
+    headers = Headers(scope=scope)
+    given = headers.get("authorization")
+    if given is not None:
+        return given, True
+    secret = cookie_parser(headers.get("cookie", "")).get(COOKIE) if method in ("GET", "HEAD") else None
+    return (None if secret is None else f"Bearer {secret}"), False
 
 
 def _find(service: Service, authorization: str) -> Token | None:

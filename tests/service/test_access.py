@@ -108,6 +108,22 @@ def test_on_loopback_none_is_needed_unless_it_is_asked_for(http: InProcess, tmp_
     service.close()
 
 
+def test_pages_keep_a_token_in_a_cookie(guarded: Service) -> None:
+    """It reads; what changes something takes the header, for a browser sends a cookie by itself."""
+    http = InProcess(create_app(guarded))
+    secret = guarded.tokens.create("eyes", [Scope.ADMIN])
+    problem(http.post("/web/session", json={"token": "octobake_wrong"}), 401, "request.bad_token")
+    answer = http.post("/web/session", json={"token": f" {secret} "})
+    assert answer.status_code == 204
+    kept = answer.headers["set-cookie"]
+    assert "HttpOnly" in kept and "SameSite=strict" in kept
+    cookie = {"cookie": kept.partition(";")[0]}
+    assert http.get("/v1/bakes", headers=cookie).status_code == 200
+    problem(http.post("/v1/cleanup", headers=cookie), 401, "request.no_token")
+    guarded.tokens.revoke("eyes")
+    problem(http.get("/v1/bakes", headers=cookie), 401, "request.no_token")
+
+
 def test_no_secret_is_kept(tmp_path: Path) -> None:
     """Through the command, with no service running."""
     at = ("--data", tmp_path / "data")

@@ -15,7 +15,7 @@ from service.jobs import Kind, State
 from service.parts import Service
 from service.retention import DAY
 from service.settings import Settings
-from service.tables import blobs, jobs, scenes
+from service.tables import blobs, jobs, metadata, scenes
 from tests.service.running import InProcess
 from tests.service.test_http import DIGEST, add_box, finished, problem, submit
 
@@ -43,7 +43,7 @@ def test_a_finished_job_expires_and_its_files_go(http: InProcess, service: Servi
     job = submit(http)["id"]
     bundle = finished(service, job)
     stray = upload(http, b"nobody's")
-    empty = {"jobs": [], "scenes": [], "blobs": 0, "bytes": 0}
+    empty = {"jobs": [], "forgotten": [], "scenes": [], "blobs": 0, "bytes": 0}
     assert http.get("/v1/cleanup").json() == http.post("/v1/cleanup").json() == empty
     age(service, 31)
     preview = http.get("/v1/cleanup").json()
@@ -62,13 +62,32 @@ def test_a_finished_job_expires_and_its_files_go(http: InProcess, service: Servi
     assert http.post(f"/v1/bakes/{job}:requeue").json()["state"] == "queued"
 
 
+def test_a_job_that_expired_long_ago_is_forgotten(http: InProcess, service: Service) -> None:
+    old, again = submit(http)["id"], submit(http)["id"]
+    for job in (old, again):
+        finished(service, job)
+    age(service, 31)
+    assert set(http.post("/v1/cleanup").json()["jobs"]) == {old, again}
+    age(service, 335)
+    preview = http.get("/v1/cleanup").json()
+    assert set(preview["forgotten"]) == {old, again} and preview["jobs"] == []
+    add_box(http)
+    assert http.post(f"/v1/bakes/{again}:requeue").status_code == 200
+    assert http.post("/v1/cleanup").json()["forgotten"] == [old]
+    problem(http.get(f"/v1/bakes/{old}"), 404, "bake.unknown")
+    with service.store._read() as c:
+        for table in metadata.sorted_tables:
+            if "job" in table.c:
+                assert c.execute(sa.select(sa.func.count()).where(table.c.job == old)).scalar_one() == 0
+
+
 def test_what_is_pinned_stays_and_so_does_what_others_need(http: InProcess, service: Service) -> None:
     pinned, shared, queued = submit(http)["id"], submit(http)["id"], submit(http, spec={"volumes": [{"fit": "scene", "counts": [2, 2, 2]}]})
     assert http.post(f"/v1/bakes/{pinned}:pin").json()["pinned"] is True
     same, other = finished(service, pinned, b"PK same"), finished(service, shared, b"PK same")
     assert same == other
     age(service, 31)
-    assert http.post("/v1/cleanup").json() == {"jobs": [shared], "scenes": [], "blobs": 0, "bytes": 0}
+    assert http.post("/v1/cleanup").json() == {"jobs": [shared], "forgotten": [], "scenes": [], "blobs": 0, "bytes": 0}
     assert http.get(f"/v1/bakes/{pinned}/bundle").content == b"PK same"
     assert http.get(f"/v1/bakes/{queued['id']}").json()["state"] == "queued"
     assert http.post(f"/v1/bakes/{pinned}:unpin").json()["pinned"] is False
@@ -104,7 +123,7 @@ def test_a_bake_that_is_to_be_verified_stays(http: InProcess, service: Service) 
     finished(service, job)
     verification = http.post("/v1/verifications", json={"bake": job}).json()["id"]
     age(service, 31)
-    assert http.post("/v1/cleanup").json() == {"jobs": [], "scenes": [], "blobs": 0, "bytes": 0}
+    assert http.post("/v1/cleanup").json() == {"jobs": [], "forgotten": [], "scenes": [], "blobs": 0, "bytes": 0}
     http.post(f"/v1/verifications/{verification}:cancel")
     age(service, 31)
     assert set(http.post("/v1/cleanup").json()["jobs"]) == {job, verification}

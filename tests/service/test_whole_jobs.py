@@ -228,6 +228,7 @@ def test_events_are_replayed_over_the_wire_from_the_last_id(client: Client, serv
     assert "event:" not in rest.text
 
 
+@pytest.mark.slow
 def test_a_service_that_listens_to_others_asks_for_a_token(tmp_path: Path, box: Path) -> None:
     """From a user's end: make a token, serve, submit with it, and see the audit log."""
     data = tmp_path / "data"

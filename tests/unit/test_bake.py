@@ -62,17 +62,17 @@ def test_the_same_bytes_for_any_threads_shards_and_packing(tmp_path: Path) -> No
         "resolution": small,
     }
     (tmp_path / "scene.glb").write_bytes(glb)
-    assert baked_alike(tmp_path / "scene.glb", spec) == 2 * 6
+    assert baked_alike(tmp_path / "scene.glb", spec) == 2 * 9
 
 
 def test_the_same_bytes_with_textures_holes_gloss_and_a_sky(tmp_path: Path) -> None:
-    assert baked_alike(write_pavilion(tmp_path), pavilion_spec()) == 6
+    assert baked_alike(write_pavilion(tmp_path), pavilion_spec()) == 9
 
 
 def test_the_same_bytes_where_easy_probes_get_fewer_samples(tmp_path: Path) -> None:
     glb, spec = small_cornell(target_error=0.01, max_samples=4096)
     (tmp_path / "scene.glb").write_bytes(glb)
-    assert baked_alike(tmp_path / "scene.glb", spec) == 3
+    assert baked_alike(tmp_path / "scene.glb", spec) == 4
     manifest = read_bundle(tmp_path / "a").manifest
     assert manifest["sampling"]["mean_samples"] < manifest["samples"]
 

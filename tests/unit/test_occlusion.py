@@ -139,10 +139,11 @@ def test_a_bake_without_visibility_says_so_and_gives_the_light_that_a_bake_with_
     (tmp_path / "all").mkdir()
     without = bake_example(tmp_path / "auto", (glb, document))
     demanded = bake_example(tmp_path / "all", (glb, document), outputs=["irradiance", "visibility"])
-    assert list(without.volumes[0].atlases) == ["irradiance"] and list(demanded.volumes[0].atlases) == ["irradiance", "visibility"]
+    assert list(without.volumes[0].atlases) == ["irradiance"] and list(demanded.volumes[0].atlases) == ["irradiance", "visibility", "walls"]
     np.testing.assert_array_equal(without.volumes[0].atlases["irradiance"].texels, demanded.volumes[0].atlases["irradiance"].texels)
     (entry,) = (x for x in without.manifest["left_out"] if x["what"] == "visibility")
-    assert "on one side" in entry["why"] and entry["bytes"] == demanded.volumes[0].atlases["visibility"].texels.size * 4
+    visibility, walls = (demanded.volumes[0].atlases[name].texels.size for name in ("visibility", "walls"))
+    assert "on one side" in entry["why"] and entry["bytes"] == visibility * 4 + walls * 2
     constants = (tmp_path / "auto" / "bundle" / "shaders" / "constants.glsl").read_text()
     assert constants != (tmp_path / "all" / "bundle" / "shaders" / "constants.glsl").read_text()
     random = np.random.default_rng(1)
@@ -164,7 +165,7 @@ def test_of_two_volumes_one_may_do_without(tmp_path: Path) -> None:
         volume["name"] = volume["name"].replace(" ", "_")
     document["stop"] = STOP
     bundle = bake_example(tmp_path, (glb, document))
-    assert [list(v.atlases) for v in bundle.volumes] == [["irradiance"], ["irradiance", "visibility"]]
+    assert [list(v.atlases) for v in bundle.volumes] == [["irradiance"], ["irradiance", "visibility", "walls"]]
     assert [x["what"] for x in bundle.manifest["left_out"] if "visibility" in x["what"]] == ["under_the_ceiling: visibility"]
     points = np.array([[-0.5, 1.7, 0.4], [0.0, 0.5, 0.0]])
     assert (sample(bundle.volumes, points, np.tile([0.0, 1.0, 0.0], (2, 1))).weights.sum(1) > 0.999).all()
