@@ -33,8 +33,7 @@ F32 = NDArray[np.float32]
 
 # A point is moved by (n · normal_bias + wo · view_bias) · bias_scale · spacing before the walls are looked up: the surface bias of Majercik
 # et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production". Theirs, 0.2, 0.8 and 0.225, was chosen for
-# moments, which blur a wall by more. What moves a point towards the viewer moves it along a wall, and from beside a thin one to behind it:
-# with a bias of 0.18 towards a grazing view, 1.6 % of the light came through 2 cm; with none, nothing does (docs/leaks.md).
+# moments, which blur a wall by more. With no bias towards the viewer, matt light does not change as somebody walks by.
 # `visibility_softness` is over what part of the distance a shadow of the walls fades: none would be a line, and half floats place a wall
 # to 0.0005. Its tail falls as the sixth power, so where no probe sees a point, as in a corner that maps round off, the least hidden one
 # answers. `visibility_floor` is where the tail ends, so that it is above what float32 holds when it has been cubed by the crush.
