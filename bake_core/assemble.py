@@ -33,8 +33,7 @@ F32 = NDArray[np.float32]
 
 # A point is moved by (n · normal_bias + wo · view_bias) · bias_scale · spacing before the walls are looked up: the surface bias of Majercik
 # et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production". Theirs, 0.2, 0.8 and 0.225, was chosen for
-# moments, which blur a wall by more. What moves a point towards the viewer moves it along a wall, and from beside a thin one to behind it:
-# with a bias of 0.18 towards a grazing view, 1.6 % of the light came through 2 cm; with none, nothing does (docs/leaks.md).
+# moments, which blur a wall by more. With no bias towards the viewer, matt light does not change as somebody walks by.
 # `visibility_softness` is over what part of the distance a shadow of the walls fades: none would be a line, and half floats place a wall
 # to 0.0005. Its tail falls as the sixth power, so where no probe sees a point, as in a corner that maps round off, the least hidden one
 # answers. `visibility_floor` is where the tail ends, so that it is above what float32 holds when it has been cubed by the crush.
@@ -59,6 +58,7 @@ def assemble(
     scene: Scene,
     spec: Spec,
     volumes: tuple[Volume, ...],
+    offsets: F32,
     selection: Selection,
     left_out: tuple[LeftOut, ...],
     state: State,
@@ -69,6 +69,8 @@ def assemble(
 
     Parameters
     ----------
+    offsets : (n, 3) float32
+        Of all volumes' probes in turn from their lattice points, metres.
     left_out : tuple of LeftOut
         Outputs and all else.
 
@@ -87,7 +89,9 @@ def assemble(
     first = 0
     for index, volume in enumerate(volumes):
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto")
+        entry, content = _volume(
+            volume, offsets[probes], selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto"
+        )
         entries.append(entry)
         data.append(content)
         size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
@@ -174,6 +178,7 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 def _volume(
     volume: Volume,
+    offsets: F32,
     outputs: tuple[OutputName, ...],
     selection: Selection,
     state: State,
@@ -230,7 +235,7 @@ def _volume(
         spacing=volume.spacing,
         counts=np.asarray(volume.counts, np.int64),
         states=states,
-        offsets=np.zeros((volume.probe_count, 3), np.float32),
+        offsets=offsets,
         backface=state.backface[probes],
         parameters=PARAMETERS,
         distance_limit=volume.distance_limit,
@@ -252,7 +257,7 @@ def _volume(
             "count": volume.probe_count,
             "active": len(kept),
             "states": states.tolist(),
-            "offsets": None,
+            "offsets": [[float(str(x)) for x in offset] for offset in offsets] if offsets.any() else None,
             # Shortest decimals of the float32 values.
             "backface": [float(str(b)) for b in state.backface[probes]],
         },

@@ -37,6 +37,7 @@ from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
 from bake_core.reach import probes_about_surfaces
+from bake_core.relocation import relocate
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
@@ -61,6 +62,8 @@ class Prepared:
     ----------
     positions : (n, 3) float64
         Of all probes of all volumes in turn, local frame.
+    offsets : (n, 3) float32
+        By how much they were moved from their lattice points.
     limits, units : (n,) float64
         Each probe's distance limit, and the smallest spacing of its volume, metres.
     needed : (n,) bool
@@ -78,6 +81,7 @@ class Prepared:
     tracer: Tracer
     whole: Tracer
     positions: NDArray[np.float64]
+    offsets: NDArray[np.float32]
     limits: NDArray[np.float64]
     units: NDArray[np.float64]
     needed: NDArray[np.bool_]
@@ -109,6 +113,10 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     spec = spec.model_copy(update={"environment": named})
     positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
     whole = Tracer.build(scene, spec, environment)
+    offsets = np.zeros(positions.shape, np.float32)
+    if spec.probes == "relocated":
+        offsets = relocate(whole, volumes, positions)
+        positions = positions + offsets
     shines = environment.sky is not None or bool(environment.constant.any())
     return Prepared(
         scene=scene,
@@ -118,6 +126,7 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
         tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
         whole=whole,
         positions=positions,
+        offsets=offsets,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
         units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
         needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
@@ -393,7 +402,15 @@ def finish(
             work = Path(folder) / "bundle"
             work.mkdir()
             manifest = assemble(
-                prepared.scene, prepared.spec, prepared.volumes, prepared.selection, prepared.left_out, state, run.stopped, work
+                prepared.scene,
+                prepared.spec,
+                prepared.volumes,
+                prepared.offsets,
+                prepared.selection,
+                prepared.left_out,
+                state,
+                run.stopped,
+                work,
             )
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)

@@ -100,7 +100,8 @@ def select(scene: Scene, spec: Spec, volumes: Sequence[Volume]) -> Selection:
     glossy = bool(shiny[np.unique(scene.triangle_material)].any())
     reflects = glossy and any(_holds(scene, volume, shiny) for volume in volumes)
     auto = spec.outputs == "auto"
-    seen = tuple(auto and nothing_occludes(scene, volume) for volume in volumes)
+    # The proof is of probes on their lattice.
+    seen = tuple(auto and spec.probes == "lattice" and nothing_occludes(scene, volume) for volume in volumes)
     if auto:
         kept = tuple(o for o in OUTPUTS if o == "irradiance" or (not all(seen) if o == "visibility" else reflects))
     else:

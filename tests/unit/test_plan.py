@@ -92,7 +92,7 @@ def test_a_plan_says_what_the_bake_then_does(tmp_path: Path) -> None:
     manifest = bake(tmp_path / "scene.glb", wanted, tmp_path / "out").manifest
     (volume,) = manifest["volumes"]
     assert (list(made.volumes[0].origin), list(made.volumes[0].counts)) == (volume["origin"], volume["counts"])
-    assert made.probes == 8 and list(made.outputs) == [a["output"] for a in volume["atlases"]]
+    assert made.probes == 8 and list(made.outputs) == [a["output"] for a in volume["atlases"] if a["output"] != "walls"]
     # What only the baked maps can tell comes after it.
     assert [x.entry() for x in made.left_out] == manifest["left_out"][: len(made.left_out)]
     stored = 0
@@ -109,6 +109,7 @@ def test_a_plan_says_what_the_bake_then_does(tmp_path: Path) -> None:
     for atlas in demanded["volumes"][0]["atlases"]:
         pixels, half = read_exr(tmp_path / "all" / atlas["file"], SpecError, "")
         sizes[atlas["output"]] = pixels.size * (2 if half else 4)
+    sizes["visibility"] += sizes["walls"]
     assert {x.what: x.bytes for x in made.left_out if x.bytes is not None} == {o: sizes[o] for o in OUTPUTS if o != "irradiance"}
 
 
@@ -146,8 +147,9 @@ def test_nothing_left_out_changes_what_is_kept(kind: str) -> None:
     both = measure(scene, wanted, threads=1)
     assert both.other == []
     # Nothing stands between the square and the probes above it.
-    assert {name.split(".")[1] for name in both.same} == ({"irradiance"} if kind == "sky" else {"irradiance", "visibility"})
-    assert len(both.everything.digests) == len(OUTPUTS)
+    assert {name.split(".")[1] for name in both.same} == ({"irradiance"} if kind == "sky" else {"irradiance", "visibility", "walls"})
+    # And the walls beside visibility.
+    assert len(both.everything.digests) == len(OUTPUTS) + 1
     assert both.without.error == both.everything.error
     assert both.without.bytes < both.everything.bytes
 
