@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.gloss_levels import gloss_alphas
 from bake_core.images import write_exr
 from bake_core.placement import Volume
-from bake_core.scene import Scene
 from bake_core.selection import LeftOut, Selection
 from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.shader_files import shader_dir
@@ -54,8 +53,19 @@ _BYTES = {"half": 2, "float": 4}
 _WORST_PROBES = 8
 
 
+class Subject(Protocol):
+    """What the manifest says of what was baked; a Scene is one."""
+
+    @property
+    def digest(self) -> str: ...
+    @property
+    def triangle_count(self) -> int: ...
+    @property
+    def ignored(self) -> tuple[str, ...]: ...
+
+
 def assemble(
-    scene: Scene,
+    scene: Subject,
     spec: Spec,
     volumes: tuple[Volume, ...],
     offsets: F32,

@@ -32,7 +32,6 @@ from bake_core.convergence import Point, decide, fit_pass, next_pass
 from bake_core.endless import check_light_ends
 from bake_core.environment import Find, no_images, read_environment
 from bake_core.errors import Cancelled, MachineError
-from bake_core.filtering import visibility_moments
 from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
@@ -48,7 +47,7 @@ from bake_core.spec import Spec
 from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
 from bake_core.unneeded import unneeded
-from bake_core.walls import walls
+from bake_core.walls import moments_and_walls
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64
@@ -297,8 +296,7 @@ def _see(
         # One row at a time: a matrix product's bits may depend on how many rows it has.
         seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
         if s.keeps("visibility"):
-            moments = visibility_moments(distance, limits[chunk], s.visibility)
-            seen["visibility"] = np.concatenate([moments, walls(distance, limits[chunk], units[chunk], s.visibility)], -1)
+            seen["visibility"] = moments_and_walls(distance, limits[chunk], units[chunk], s.visibility)
         if s.keeps("distance"):
             seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
         if s.keeps("normal"):

@@ -73,6 +73,31 @@ def cornell() -> Example:
     return w.to_glb(), {"version": 1, "volumes": [grid]}
 
 
+def glossy_cornell(roughness: float, color: Vec3 = (0.95, 0.93, 0.88)) -> Example:
+    """A Cornell box that is closed all round, its boxes of metal: mirrors at roughness 0. A lamp, and no other light.
+
+    All that the metal shows is what probes saw. The 6 × 6 × 6 probes are 32 cm apart.
+    """
+    w = GlbWriter()
+    white = w.material("white", (0.76, 0.75, 0.72))
+    left = w.material("terracotta", (0.65, 0.13, 0.06))
+    right = w.material("teal", (0.05, 0.32, 0.38))
+    metal = w.material("metal", color, metallic=1.0, roughness=roughness)
+    lamp = w.material("lamp", (0.78, 0.78, 0.78), emission=(9.0, 7.2, 4.8))
+    sides = box_sides((-1, 0, -1), (1, 2, 1))
+    glow = _horizontal((-0.35, 0.35), (-0.3, 0.3), 1.99, up=False)
+    plain = quads_part([sides[2], sides[3], sides[4], sides[5]], white)
+    room = w.mesh("room", [plain, quads_part([sides[0]], left), quads_part([sides[1]], right), quads_part([glow], lamp)])
+    faces = box_sides((-0.5, 0, -0.5), (0.5, 1, 0.5))
+    block = w.mesh("block", [quads_part([f for i, f in enumerate(faces) if i != 2], metal, outwards=True)])
+    w.node("room", mesh=room)
+    w.node("tall block", mesh=block, matrix=_turned((0.58, 1.2, 0.58), (0.96, 0.28), (-0.36, 0, -0.36)))
+    w.node("short block", mesh=block, matrix=_turned((0.56, 0.56, 0.56), (0.936, -0.352), (0.38, 0, 0.32)))
+    w.node("front", camera=w.camera(math.radians(62)), matrix=look_at((0.55, 1.2, 0.95), (-0.15, 0.6, -0.6)))
+    grid = {"name": "room", "origin": [-0.8, 0.2, -0.8], "spacing": [0.32, 0.32, 0.32], "counts": [6, 6, 6]}
+    return w.to_glb(), {"version": 1, "volumes": [grid]}
+
+
 def _turned(size: Vec3, turn: tuple[float, float], position: Vec3) -> NDArray[np.float64]:
     """Scale, then turn about +y by the angle whose cosine and sine are `turn`, then move."""
     cosine, sine = turn

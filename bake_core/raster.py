@@ -21,6 +21,7 @@ from bake_core.scene_buffers import light_buffer, material_buffers, mesh_buffers
 from bake_core.shader_compiler import compile_glsl, shader_text
 from bake_core.shadow_views import NEAR, Batch, batches, corners, view_matrices
 from bake_core.textures import TextureTable
+from bake_core.volume_chains import traceable
 from bake_core.vulkan import Bindings, Buffer, Commands, Device, Image, color_target, depth_target, graphics_pipeline, storage
 
 F64 = NDArray[np.float64]
@@ -196,7 +197,8 @@ def picture_fragment_shader(volumes: Sequence[VolumeData], frame: ArrayLike, *, 
     holes : bool
         Whether any surface is cut out or blended: to ask costs every scene's hidden surfaces their early depth test.
     """
-    probes = probe_module(volumes, _FIRST_PROBE_BINDING, frame)
+    glossy = ("glossy_diffuse.glsl", "glossy_traced.glsl" if traceable(volumes) else "glossy_untraced.glsl")
+    probes = probe_module(volumes, _FIRST_PROBE_BINDING, frame) + "\n".join(shader_text(f"verification/{part}") for part in glossy)
     head = "#define HOLES\n" if holes else ""
     return _fragment_shader("picture.frag", "textures.glsl", "gloss.glsl", "lights.glsl", before=head, after=probes)
 

@@ -55,8 +55,9 @@ def trace_check(
     -------
     dict
         ``rays``, ``device`` and ``rows``; each row has ``volumes`` (spacing and probes of each), ``spacing`` (how many times the bundle's),
-        ``resolution``, ``bundle`` (whether it is the bundle as it stands), and ``python``: an :class:`bake_core.trace_check.Agreement`;
-        under ``glsl``, too, with the bundle's own resolution: a driver takes seconds to compile the module for each.
+        ``resolution``, ``bundle`` (whether it is the bundle as it stands), and under ``python`` an
+        :class:`bake_core.trace_check.Agreement`; under ``glsl``, too, with the bundle's own resolution: a driver takes seconds to compile
+        the module for each.
 
     Raises
     ------

@@ -26,12 +26,15 @@ from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
 from bake_core.published_weights import ddgi, trilinear
 from bake_core.raster import Rasterizer
+from bake_core.ray_radiance import measure_radiance
 from bake_core.receiver_comparison import compare_receivers, measure_receivers
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
 from bake_core.thresholds import Thresholds
+from bake_core.trace_check import compare_traces
 from bake_core.tracer import Tracer
 from bake_core.verification_report import PARTS, page, write_pictures
+from bake_core.volume_chains import traceable
 from bake_core.vulkan import Device
 
 REPORT = "verification.json"
@@ -43,6 +46,8 @@ LARGEST_SIDE, MOST_SAMPLES = 8192, 1 << 20
 _SEEDS = (0x0C70BA4E, 0x0C70BA4F)
 # From each receiver, for one a pixel: 2,048 receivers take a seventh of what the default picture does, and their noise stays out of sight.
 _PATHS_PER_SAMPLE = 16
+# Along each ray that leaves a surface: half of the time of the receivers, whose paths are one vertex longer.
+_PATHS_PER_RAY = 8
 # Along each side of a pixel that shows sky.
 _SKY_POINTS = 4
 
@@ -68,7 +73,7 @@ def verify(
     2. Choose cameras: those given, else the glTF's own, else automatic ones.
     3. For each camera, rasterise on Vulkan with the bundle's probes, and path-trace two halves of the reference.
     4. Compare the indirect part and the whole, hold the figures against the thresholds.
-    5. Do the same with the bundle's irradiance at thousands of surface points.
+    5. Do the same with the bundle's irradiance at thousands of surface points, and with radiance along rays where it has that.
     6. Write everything into a folder beside `out`, and put that in its place.
 
     Parameters
@@ -127,6 +132,7 @@ def verify(
                 entries.append(_entry(work, camera, name, raster, halves, inside, thresholds, seconds))
             name = device.name
         receivers = _receivers(work, bundle, scene, tracer, samples, thresholds, threads, tell.part(len(cameras), parts), cancelled)
+        glossy = _glossy(bundle, scene, tracer, samples, threads, cancelled) if traceable(bundle.volumes) else None
         tell("writing", 1.0)
         report: dict[str, Any] = {
             "passed": not any(e["failures"] for e in [*entries, receivers]),
@@ -141,6 +147,7 @@ def verify(
             "thresholds": thresholds.model_dump(mode="json"),
             "cameras": entries,
             "receivers": receivers,
+            "glossy": glossy,
             "seconds": time.perf_counter() - started,
         }
         (work / REPORT).write_bytes(dump_json(report))
@@ -309,6 +316,22 @@ def _receivers(
         **asdict(figures),
         "beside": {name: {"mean_ratio": f.mean_ratio, "relmse": f.relmse, "p95": f.p95} for name, f in beside.items()},
         "failures": thresholds.receivers.failures(figures),
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def _glossy(
+    bundle: Bundle, scene: Scene, tracer: Tracer, samples: int, threads: int, cancelled: NDArray[np.uint8] | None
+) -> dict[str, Any]:
+    """The report's part on radiance along rays that leave surfaces: what a mirror shows."""
+    begun = time.perf_counter()
+    paths = _PATHS_PER_RAY * samples
+    rays, traces, answers, estimates = measure_radiance(scene, tracer, bundle.volumes, samples=paths, threads=threads, cancelled=cancelled)
+    return {
+        "count": len(answers),
+        "samples": paths,
+        **asdict(compare_receivers(answers, estimates)),
+        "rays": asdict(compare_traces(bundle.volumes, rays, traces)),
         "seconds": time.perf_counter() - begun,
     }
 

@@ -89,6 +89,8 @@ def page(report: dict[str, Any]) -> str:
             f"<ul class=bad>{failures}</ul><div class=row>{pictures}</div>"
         )
     blocks.append(_receivers(report["receivers"]))
+    if report["glossy"] is not None:
+        blocks.append(_glossy(report["glossy"]))
     facts = f"{report['width']} × {report['height']}, {report['samples']} paths a pixel, {html.escape(report['device'])}"
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
@@ -114,6 +116,28 @@ def _receivers(figures: dict[str, Any]) -> str:
             for name, row in [("receivers", figures), *((words, figures["beside"][way]) for way, words in BESIDE.items())]
         )
         + f"</table><ul class=bad>{failures}</ul><p>{html.escape(receiver_facts(figures))}.</p>"
+    )
+
+
+def _glossy(figures: dict[str, Any]) -> str:
+    """The block on radiance along rays."""
+    columns = (("mean ratio", "mean_ratio"), ("relMSE", "relmse"), ("95th percentile", "p95"))
+    return (
+        f"<h2>Radiance along {figures['count']} rays from surfaces</h2><table><tr><th></th>"
+        + "".join(f"<th>{title}</th>" for title, _ in columns)
+        + "</tr><tr><th>rays</th>"
+        + "".join(f"<td>{number(figures[key])}</td>" for _, key in columns)
+        + f"</tr></table><p>{html.escape(glossy_facts(figures))}.</p>"
+    )
+
+
+def glossy_facts(figures: dict[str, Any]) -> str:
+    """What became of the rays, in a line."""
+    rays = figures["rays"]
+    return (
+        f"{figures['count']} rays, {figures['samples']} paths along each; {100 * rays['agree']:.2f} % meet what they should, "
+        f"{100 * rays['false_hits']:.2f} % are false hits, {100 * rays['unknown']:.2f} % unknown; "
+        f"noise of the reference: relMSE {number(figures['reference_noise'])}"
     )
 
 

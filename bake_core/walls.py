@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bake_core.filtering import visibility_moments
 from bake_core.kernels import entry_kernel
 from bake_core.octahedral import dir_to_oct, texel_directions, with_border
 
@@ -100,6 +101,11 @@ def _fit_kernel(texels, weights, start, values, steps, gradient, way, image, out
                 size += gradient[i] * gradient[i]
             for i in range(n):
                 way[i] = gradient[i] + size / before * way[i]
+
+
+def moments_and_walls(distance: F64, limits: F64, units: F64, resolution: int) -> NDArray[np.float32]:
+    """What tells how far a probe sees, (p, resolution, resolution, 3): :func:`bake_core.filtering.visibility_moments`, and :func:`walls`."""
+    return np.concatenate([visibility_moments(distance, limits, resolution), walls(distance, limits, units, resolution)], -1)
 
 
 def walls(distance: F64, limit: F64, unit: F64, resolution: int) -> NDArray[np.float32]:

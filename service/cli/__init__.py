@@ -14,6 +14,7 @@ from bake_core.errors import OctobakeError
 # In the order of --help. A command's module imports what it needs inside `run`, so that `octobake status` does not wait for numba.
 COMMANDS = (
     "bake",
+    "import-cubemaps",
     "plan",
     "info",
     "sample",

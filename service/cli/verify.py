@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from bake_core.scene_files import load_scene
     from bake_core.thresholds import load_thresholds
     from bake_core.verification import verify
-    from bake_core.verification_report import receiver_facts
+    from bake_core.verification_report import glossy_facts, receiver_facts
     from service.cli.progress import ProgressLine
 
     cameras = load_cameras(args.camera) if args.camera else None
@@ -78,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(table(report))
         print(receiver_facts(report["receivers"]))
+        if report["glossy"] is not None:
+            print(glossy_facts(report["glossy"]))
         print(f"{args.out / 'index.html'}: {'passed' if report['passed'] else 'failed'}, {report['seconds']:.1f} s")
     for failure in report["failures"]:
         print(f"octobake: {failure}", file=sys.stderr)
@@ -98,5 +100,8 @@ def table(report: dict[str, Any]) -> str:
     receivers = report["receivers"]
     for part, f in [("irradiance", receivers), *((words, receivers["beside"][way]) for way, words in BESIDE.items())]:
         rows.append(("receivers", part, number(f["mean_ratio"]), number(f["relmse"]), "", number(f["p95"])))
+    if report["glossy"] is not None:
+        g = report["glossy"]
+        rows.append(("rays", "radiance", number(g["mean_ratio"]), number(g["relmse"]), "", number(g["p95"])))
     widths = [max(len(row[i]) for row in rows) for i in range(6)]
     return "\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows)

@@ -60,14 +60,7 @@ void main() {
     }
     vec3 indirect = (glossy ? gloss.under : base) / PI * obIrradiance(position, ns, wo);
     if (glossy) {
-        // Radiance over the lobe from irradiance on two planes, across its mean direction (Lagarde and de Rousiers 2014, "Moving Frostbite to
-        // Physically Based Rendering"): exact where light varies in proportion to a cosine, for then either is pi (L0 +- 2/3 L1).
-        float smoothness = 1.0 - gloss.roughness;
-        vec3 mean = normalize(mix(ns, reflect(-gloss.wo, ns), smoothness * (sqrt(smoothness) + gloss.roughness)));
-        float length = 1.5 * lobeCosine(gloss);
-        vec3 before = obIrradianceToward(position, ns, wo, mean);
-        vec3 behind = obIrradianceToward(position, ns, wo, -mean);
-        indirect += gloss.specular / PI * max(0.5 * (1.0 + length) * before + 0.5 * (1.0 - length) * behind, 0.0);
+        indirect += gloss.specular * lobeRadiance(position, ng, ns, wo, gloss);
     }
     outDirect = vec4(direct, 1.0);
     outIndirect = vec4(indirect, 1.0);
