@@ -31,6 +31,7 @@ COMMANDS = (
     "cancel",
     "fetch",
     "token",
+    "warmup",
     "demo",
 )
 EXIT_CODES = "exit codes: 0 done; 2 bad input or usage; 3 failed; 4 out of budget before the target error; 5 a verification failed"
