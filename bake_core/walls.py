@@ -104,7 +104,7 @@ def _fit_kernel(texels, weights, start, values, steps, gradient, way, image, out
 
 
 def moments_and_walls(distance: F64, limits: F64, units: F64, resolution: int) -> NDArray[np.float32]:
-    """What tells how far a probe sees, (p, resolution, resolution, 3): :func:`bake_core.filtering.visibility_moments`, and :func:`walls`."""
+    """How far a probe sees, (p, resolution, resolution, 3): :func:`bake_core.filtering.visibility_moments`, then :func:`walls`."""
     return np.concatenate([visibility_moments(distance, limits, resolution), walls(distance, limits, units, resolution)], -1)
 
 
