@@ -4,7 +4,7 @@ BIN := .venv/bin
 LOCKS := requirements.txt requirements-dev.txt
 PROJECTS := pyproject.toml clients/python/pyproject.toml
 
-.PHONY: help setup system-packages demo check test test-slow lock clean
+.PHONY: help setup system-packages demo check test test-slow chaos service-figures image-test lock clean
 .DELETE_ON_ERROR:
 
 help:
@@ -12,6 +12,9 @@ help:
 	@echo "make demo        setup; then serve, upload, bake and verify a Cornell box: pictures and figures in out/demo"
 	@echo "make test        setup; then every test but the slow ones (ARGS=... goes to pytest)"
 	@echo "make test-slow   setup; then the tests that take minutes"
+	@echo "make chaos       setup; then 1,000 random kills of a service and its worker, about an hour (ARGS=\"--kills N --seed S\")"
+	@echo "make service-figures   setup; then what the service holds under load, two minutes on a quiet machine"
+	@echo "make image-test  build docker/Dockerfile with buildah (root, Debian), start it, bake and verify through it"
 	@echo "make check       setup; then lint, format, types, import layers, shaders for both targets"
 	@echo "make lock        choose package versions anew, and write them with their hashes to $(LOCKS)"
 	@echo "make clean       remove .venv and everything generated"
@@ -39,6 +42,15 @@ test: setup
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+chaos: setup
+	$(BIN)/python -m tests.service.chaos $(ARGS)
+
+service-figures: setup
+	$(BIN)/python -m tests.service.figures $(ARGS)
+
+image-test:
+	docker/image-test
 
 check: setup
 	$(BIN)/ruff check .

@@ -30,18 +30,23 @@ from bake_core.volume_chains import CHAINS, chain_levels, chain_size, traceable,
 
 F32 = NDArray[np.float32]
 
-# Majercik et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production": the surface bias is
-# (n · 0.2 + wo · 0.8) · 0.75 · spacing · 0.3; 0.05 is the least a probe's visibility weighs, so that a cell is never left without light.
+# A point is moved by (n · normal_bias + wo · view_bias) · bias_scale · spacing before the walls are looked up: the surface bias of Majercik
+# et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production". Theirs, 0.2, 0.8 and 0.225, was chosen for
+# moments, which blur a wall by more. With no bias towards the viewer, matt light does not change as somebody walks by.
+# `visibility_softness` is over what part of the distance a shadow of the walls fades: none would be a line, and half floats place a wall
+# to 0.0005. Its tail falls as the sixth power, so where no probe sees a point, as in a corner that maps round off, the least hidden one
+# answers. `visibility_floor` is where the tail ends, so that it is above what float32 holds when it has been cubed by the crush.
 PARAMETERS = {
-    "normal_bias": 0.2,
-    "view_bias": 0.8,
-    "bias_scale": 0.225,
-    "visibility_floor": 0.05,
+    "normal_bias": 0.15,
+    "view_bias": 0.0,
+    "bias_scale": 1.0,
+    "visibility_floor": 1e-9,
+    "visibility_softness": 0.01,
     "visibility_sharpness": float(VISIBILITY_SHARPNESS),
 }
 # Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
 # flat-wall variances come out negative). Distances are metres of any scale.
-_ALWAYS_FULL: tuple[OutputName, ...] = ("visibility", "distance")
+_ALWAYS_FULL = ("visibility", "distance")
 
 _BYTES = {"half": 2, "float": 4}
 # As many as anybody would go and look at.
@@ -63,6 +68,7 @@ def assemble(
     scene: Subject,
     spec: Spec,
     volumes: tuple[Volume, ...],
+    offsets: F32,
     selection: Selection,
     left_out: tuple[LeftOut, ...],
     state: State,
@@ -73,6 +79,8 @@ def assemble(
 
     Parameters
     ----------
+    offsets : (n, 3) float32
+        Of all volumes' probes in turn from their lattice points, metres.
     left_out : tuple of LeftOut
         Outputs and all else.
 
@@ -87,15 +95,17 @@ def assemble(
         ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
     """
     active = state.active()
-    entries, data, saved = [], [], 0
+    entries, data, saved = [], [], np.zeros(2, np.int64)
     first = 0
-    for volume in volumes:
+    for index, volume in enumerate(volumes):
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(volume, selection, state, active, probes, folder, whole=spec.outputs != "auto")
+        entry, content = _volume(
+            volume, offsets[probes], selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto"
+        )
         entries.append(entry)
         data.append(content)
-        inside = volume.probe_count - entry["probes"]["active"]
-        saved += inside * sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
+        size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
+        saved += np.array([(content.states == state).sum() * size for state in (0, 2)])
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
@@ -114,20 +124,22 @@ def assemble(
         "stopped": stopped,
         "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
         "error": _error(spec, volumes, selection, state),
-        "left_out": [x.entry() for x in left_out] + _left_out_probes(active, saved) + _left_out_channels(entries, data),
+        "left_out": [x.entry() for x in left_out] + _left_out_probes(state, saved) + _left_out_channels(entries, data),
         "volumes": entries,
         "shaders": [f"shaders/{name}" for name in (*SHADERS, "constants.glsl")],
         "files": {name: {"sha256": digest_file(folder / name), "bytes": (folder / name).stat().st_size} for name in names},
     }
 
 
-def _left_out_probes(active: NDArray[np.bool_], saved: int) -> list[dict[str, Any]]:
-    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression."""
-    inside = len(active) - int(active.sum())
-    if not inside:
-        return []
-    why = "inside solids: more than a quarter of what they see are backs of single-sided surfaces"
-    return [{"what": f"{inside} of {len(active)} probes", "why": why, "bytes": saved}]
+def _left_out_probes(state: State, saved: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """What the manifest says of probes that are neither traced nor stored; `saved` bytes before compression, by the two reasons."""
+    count = [int((state.needed & ~state.active()).sum()), int((~state.needed).sum())]
+    why = [
+        "inside solids: more than a quarter of what they see are backs of single-sided surfaces",
+        "needed by no surface: none lies in the cells around them, and the spec's receivers are surfaces",
+    ]
+    whole = len(state.needed)
+    return [{"what": f"{n} of {whole} probes", "why": w, "bytes": int(b)} for n, w, b in zip(count, why, saved, strict=True) if n]
 
 
 def _left_out_channels(entries: list[dict[str, Any]], data: list[VolumeData]) -> list[dict[str, Any]]:
@@ -175,11 +187,22 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
 
 
 def _volume(
-    volume: Volume, selection: Selection, state: State, active: NDArray[np.bool_], probes: slice, folder: Path, *, whole: bool
+    volume: Volume,
+    offsets: F32,
+    outputs: tuple[OutputName, ...],
+    selection: Selection,
+    state: State,
+    active: NDArray[np.bool_],
+    probes: slice,
+    folder: Path,
+    *,
+    whole: bool,
 ) -> tuple[dict[str, Any], VolumeData]:
     """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
     kept = np.flatnonzero(active[probes])
-    maps = {output: _interior(output, selection, state, probes)[kept] for output in selection.outputs}
+    maps: dict[str, F32] = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
+    if "visibility" in maps:
+        maps["visibility"], maps["walls"] = maps["visibility"][..., :2], maps["visibility"][..., 2:]
     tiles = [m.shape[1] + 2 for m in maps.values()]
     shape = layout(volume.counts, max(tiles), len(kept))
     atlases: dict[str, Atlas] = {}
@@ -215,13 +238,14 @@ def _volume(
             atlas = replace(atlas, miss=selection.miss_distance)
         atlases[output] = atlas
         described.append(entry)
+    states = np.where(active[probes], 1, np.where(state.needed[probes], 0, 2)).astype(np.uint8)
     content = VolumeData(
         name=volume.name,
         origin=volume.origin,
         spacing=volume.spacing,
         counts=np.asarray(volume.counts, np.int64),
-        states=active[probes].astype(np.uint8),
-        offsets=np.zeros((volume.probe_count, 3), np.float32),
+        states=states,
+        offsets=offsets,
         backface=state.backface[probes],
         parameters=PARAMETERS,
         distance_limit=volume.distance_limit,
@@ -242,8 +266,8 @@ def _volume(
             "file": probe_file,
             "count": volume.probe_count,
             "active": len(kept),
-            "states": active[probes].astype(int).tolist(),
-            "offsets": None,
+            "states": states.tolist(),
+            "offsets": [[float(str(x)) for x in offset] for offset in offsets] if offsets.any() else None,
             # Shortest decimals of the float32 values.
             "backface": [float(str(b)) for b in state.backface[probes]],
         },

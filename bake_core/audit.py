@@ -169,9 +169,10 @@ def audit(
     began = now()
     random = np.random.default_rng([_SEED, baked.spec.seed])
     active = np.flatnonzero(baked.state.active())
-    stored = baked.volumes[0].atlases.keys()
-    kinds = [kind for kind in ("visibility", "radiance", "irradiance") if kind in stored and len(active)]
-    surfaces = "irradiance" in stored and baked.scene.triangle_count > 0
+    # Visibility is an output that some volumes may have and others not.
+    having = {kind: _having(baked.volumes, kind, active) for kind in ("visibility", "radiance", "irradiance")}
+    kinds = [kind for kind, probes in having.items() if len(probes)]
+    surfaces = "irradiance" in baked.volumes[0].atlases and baked.scene.triangle_count > 0
     texels: dict[str, Figures] = {}
     found: tuple[Figures, float | None] | None = None
 
@@ -181,7 +182,7 @@ def audit(
 
     audits = {"visibility": _visibility, "radiance": _radiance, "irradiance": _irradiance}
     for kind in kinds:
-        texels[kind] = audits[kind](baked, random, active, look(kind))
+        texels[kind] = audits[kind](baked, random, having[kind], look(kind))
     if surfaces:
         found = _surfaces(baked, look("surfaces"))
     stated = baked.state.error()
@@ -300,6 +301,13 @@ def _volume_of(volumes: Sequence[VolumeData], probes: I64) -> tuple[I64, I64]:
     return of.astype(np.int64), probes - first[of]
 
 
+def _having(volumes: Sequence[VolumeData], output: str, probes: I64) -> I64:
+    """Those probes whose volume has an output."""
+    has = np.array([output in v.atlases for v in volumes])
+    of, _ = _volume_of(volumes, probes)
+    return probes[np.flatnonzero(has[of])]
+
+
 def _stored(volumes: Sequence[VolumeData], output: str, probes: I64, texels: I64) -> F64:
     """(n, c) float64: texels out of a bundle's atlases, by the bake's probe number and the texel's."""
     of, probe = _volume_of(volumes, probes)
@@ -371,7 +379,7 @@ def _radiance(baked: Baked, random: np.random.Generator, active: I64, look: _Loo
 
 def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _Look) -> Figures:
     """Of both moments, in units of the distance limit and its square, so that the two are numbers of one kind."""
-    side = baked.volumes[0].atlases["visibility"].interior
+    side = next(v.atlases["visibility"].interior for v in baked.volumes if "visibility" in v.atlases)
     # Each probe at most once while there are enough of them.
     probes = np.concatenate([random.permutation(active) for _ in range(-(-_FEWEST // len(active)))])[:_MOST]
     texels = random.integers(0, side**2, len(probes))
@@ -386,7 +394,7 @@ def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _L
     some = slice(0, estimates.shape[1])
     probes, texels, unit = probes[some], texels[some], np.stack([limits[some], limits[some] ** 2], -1)
     stored = _stored(baked.volumes, "visibility", probes, texels) / unit
-    intended = baked.state.visibility[probes].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
+    intended = baked.state.visibility[probes, ..., :2].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
     mean = float(np.sqrt((stored**2).sum(-1)).mean())
     return _figures(stored, intended, estimates / unit, np.zeros(len(probes)), mean, probes, paths)
 
@@ -406,7 +414,7 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
     estimates, paths = look.at(len(receivers), trace)
     n = estimates.shape[1]
     answers = sample(baked.volumes, receivers.positions[:n], receivers.normals[:n])
-    scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volume, answers.probes, answers.weights)
+    scrambles = _answers_of_scrambles(baked, receivers.normals[:n], answers.volumes, answers.probes, answers.weights)
     mean = float(np.sqrt((answers.irradiance**2).sum(-1)).mean())
     if baked.state.samples < SCRAMBLES:
         return _figures(answers.irradiance, answers.irradiance, estimates, None, mean, answers.probes[:, 0], paths), None
@@ -420,7 +428,7 @@ def _surfaces(baked: Baked, look: _Look) -> tuple[Figures, float | None] | None:
 def _answers_of_scrambles(baked: Baked, normals: F64, volumes: I64, probes: I64, weights: F64) -> F64:
     """(n, SCRAMBLES, 3): what the query would answer from each scramble alone; it is linear in irradiance, its weights know none of it."""
     first = np.cumsum([0] + [len(v.states) for v in baked.volumes])
-    touched, index = np.unique(probes + first[volumes][:, None], return_inverse=True)
+    touched, index = np.unique(probes + first[volumes], return_inverse=True)
     index = index.reshape(probes.shape)
     side = baked.volumes[0].atlases["irradiance"].interior
     means = baked.state.scramble_means(touched)

@@ -86,7 +86,7 @@ def _places(volumes: Sequence[VolumeData], count: int) -> F64:
     """Probe positions spread over the volumes, (at most `count`, 3), of those that see the fewest back faces."""
     positions, backs = [], []
     for v in volumes:
-        usable = v.states > 0 if v.states.any() else np.ones(len(v.states), bool)
+        usable = v.states == 1 if (v.states == 1).any() else np.ones(len(v.states), bool)
         positions.append(v.positions()[usable])
         backs.append(v.backface[usable])
     position, back = np.concatenate(positions), np.concatenate(backs)

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
-from bake_core.assemble import assemble
+from bake_core.assemble import PARAMETERS, assemble
 from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
 from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
@@ -32,18 +32,22 @@ from bake_core.convergence import Point, decide, fit_pass, next_pass
 from bake_core.endless import check_light_ends
 from bake_core.environment import Find, no_images, read_environment
 from bake_core.errors import Cancelled, MachineError
-from bake_core.filtering import visibility_moments
 from bake_core.octahedral import texel_solid_angles
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
+from bake_core.reach import probes_about_surfaces
+from bake_core.relocation import relocate
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
+from bake_core.sealed import is_sealed
 from bake_core.selection import LeftOut, Selection, select
+from bake_core.shader_constants import biases
 from bake_core.spec import Spec
 from bake_core.tally import State, Tally, outside
 from bake_core.tracer import Tracer
 from bake_core.unneeded import unneeded
+from bake_core.walls import moments_and_walls
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
 _DISTANCE_CHUNK = 64
@@ -57,8 +61,16 @@ class Prepared:
     ----------
     positions : (n, 3) float64
         Of all probes of all volumes in turn, local frame.
-    limits : (n,) float64
-        Each probe's distance limit, metres.
+    offsets : (n, 3) float32
+        By how much they were moved from their lattice points.
+    limits, units : (n,) float64
+        Each probe's distance limit, and the smallest spacing of its volume, metres.
+    needed : (n,) bool
+        Which of them are baked at all, unless they turn out to stand inside a solid.
+    tracer : Tracer
+        What probes are traced with.
+    whole : Tracer
+        The scene as it is: what audits look at. It has an environment that `tracer` may do without.
     """
 
     scene: Scene
@@ -66,8 +78,12 @@ class Prepared:
     volumes: tuple[Volume, ...]
     selection: Selection
     tracer: Tracer
+    whole: Tracer
     positions: NDArray[np.float64]
+    offsets: NDArray[np.float32]
     limits: NDArray[np.float64]
+    units: NDArray[np.float64]
+    needed: NDArray[np.bool_]
 
     @property
     def probe_count(self) -> int:
@@ -76,7 +92,7 @@ class Prepared:
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
         """Outputs first, then what kernels do without."""
-        return self.selection.left_out + unneeded(self.tracer.tables)
+        return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
 
 
 def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
@@ -94,16 +110,36 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     volumes = place(scene, spec)
     environment, named = read_environment(spec.environment, find)
     spec = spec.model_copy(update={"environment": named})
-    probes = sum(v.probe_count for v in volumes)
+    positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
+    whole = Tracer.build(scene, spec, environment)
+    offsets = np.zeros(positions.shape, np.float32)
+    if spec.probes == "relocated":
+        offsets = relocate(whole, volumes, positions)
+        positions = positions + offsets
+    shines = environment.sky is not None or bool(environment.constant.any())
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
-        selection=select(scene, spec, probes),
-        tracer=Tracer.build(scene, spec, environment),
-        positions=np.concatenate([v.positions() for v in volumes]) - scene.origin,
+        selection=select(scene, spec, volumes),
+        tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
+        whole=whole,
+        positions=positions,
+        offsets=offsets,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
+        units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
+        needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
     )
+
+
+def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:
+    """Which probes any query on a surface asks, (n,) bool, of all volumes in turn: :func:`bake_core.reach.probes_about_surfaces`.
+
+    Surfaces are taken as far off as a query moves its point before it asks for visibility, which bounds what a renderer does to points.
+    """
+    counts = [np.asarray(v.counts, np.int64) for v in volumes]
+    margins = [sum(biases(PARAMETERS, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
+    return np.concatenate([probes_about_surfaces(scene, v, margin) for v, margin in zip(volumes, margins, strict=True)])
 
 
 def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
@@ -128,9 +164,10 @@ def empty_state(prepared: Prepared) -> State:
             samples=0,
             taken=start.taken,
             eighths=start.eighths,
+            needed=prepared.needed.copy(),
             irradiance=np.zeros((n, SCRAMBLES, s.irradiance**2, 3), np.float32),
             radiance=np.zeros((n, HALVES, s.capture**2, 3) if s.keeps("radiance") else (0, 0, 0, 0), np.float32),
-            visibility=np.zeros((n, s.visibility, s.visibility, 2) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
+            visibility=np.zeros((n, s.visibility, s.visibility, 3) if s.keeps("visibility") else (0, 0, 0, 0), np.float32),
             backface=np.zeros(n, np.float32),
             distance=np.zeros((n, s.distance**2) if s.keeps("distance") else (0, 0), np.float32),
             normal=np.zeros((n, s.normal**2, 3) if s.keeps("normal") else (0, 0, 0), np.float32),
@@ -178,9 +215,11 @@ def trace_shard(
     seen: dict[str, NDArray[np.float32]] = {}
     looked = 0
     if samples[0] == 0:
-        seen, looked = _see(prepared, positions, prepared.limits[slice(*probes)], threads, flag)
-        kept = outside(seen["backface"])
-        seen = {name: values if name == "backface" else values[kept] for name, values in seen.items()}
+        needed = prepared.needed[slice(*probes)]
+        seen, looked = _see(prepared, probes[0] + np.flatnonzero(needed), threads, flag)
+        free = outside(seen["backface"])
+        seen = {name: values if name == "backface" else values[free] for name, values in seen.items()}
+        seen["backface"], kept = _spread(seen["backface"], needed), _spread(free, needed)
         spans[~kept, :, 1] = spans[~kept, :, 0]
     else:
         kept = allocation.eighths[slice(*probes)].max(1) > 0
@@ -209,6 +248,13 @@ def trace_shard(
     )
 
 
+def _spread(values: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
+    """Values of those where a mask says so; zeros for the others."""
+    out = np.zeros(len(where), values.dtype)
+    out[where] = values
+    return out
+
+
 def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
     """Sums in single precision: 2⁻²⁴ of a value is far below what its samples know. What overflows is refused where maps are checked."""
     with np.errstate(over="ignore"):
@@ -219,7 +265,7 @@ def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
     if audited:
-        compile_audit(prepared.scene, prepared.tracer)
+        compile_audit(prepared.scene, prepared.whole)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -237,10 +283,11 @@ def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint
 
 
 def _see(
-    prepared: Prepared, positions: NDArray[np.float64], limits: NDArray[np.float64], threads: int, flag: NDArray[np.uint8]
+    prepared: Prepared, probes: NDArray[np.int64], threads: int, flag: NDArray[np.uint8]
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
     """Distances and what is made of them, a few probes at a time on each thread; and how many rays they took."""
     s = prepared.selection
+    positions, limits, units = (np.ascontiguousarray(a[probes]) for a in (prepared.positions, prepared.limits, prepared.units))
     solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
 
     def look(first: int) -> tuple[dict[str, NDArray[np.float32]], int]:
@@ -249,7 +296,7 @@ def _see(
         # One row at a time: a matrix product's bits may depend on how many rows it has.
         seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
         if s.keeps("visibility"):
-            seen["visibility"] = visibility_moments(distance, limits[chunk], s.visibility)
+            seen["visibility"] = moments_and_walls(distance, limits[chunk], units[chunk], s.visibility)
         if s.keeps("distance"):
             seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
         if s.keeps("normal"):
@@ -353,7 +400,15 @@ def finish(
             work = Path(folder) / "bundle"
             work.mkdir()
             manifest = assemble(
-                prepared.scene, prepared.spec, prepared.volumes, prepared.selection, prepared.left_out, state, run.stopped, work
+                prepared.scene,
+                prepared.spec,
+                prepared.volumes,
+                prepared.offsets,
+                prepared.selection,
+                prepared.left_out,
+                state,
+                run.stopped,
+                work,
             )
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)
@@ -370,7 +425,7 @@ def finish(
 def _audit(prepared: Prepared, state: State, work: Path, seconds: float, threads: int, cancelled: NDArray[np.uint8] | None) -> Audit | None:
     """Of what has just been written; None where somebody has no more time for it."""
     volumes = bundle.read_bundle(work).volumes
-    baked = Baked(prepared.scene, prepared.spec, prepared.tracer, state, volumes, prepared.positions, prepared.limits)
+    baked = Baked(prepared.scene, prepared.spec, prepared.whole, state, volumes, prepared.positions, prepared.limits)
     try:
         return audit(baked, seconds, threads=threads, cancelled=cancelled)
     except Cancelled:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.atlas import Layout, unpack
 from bake_core.bake import Prepared, check_finite, compile_kernels, finish, gather, prepare
-from bake_core.bundle import read_bundle
+from bake_core.bundle import VolumeData, read_bundle
 from bake_core.clock import Clock
 from bake_core.environment import Find, no_images
 from bake_core.report import Run
@@ -29,7 +34,7 @@ class Way:
     error : float or None
         The error figure.
     digests : dict of str to str
-        SHA-256 of the texels as a reader has them, by ``volume.output``: however many channels a file spends on them.
+        SHA-256 of the texels that both bakes have as a reader has them, by ``volume.output``: however many channels a file spends on them.
     """
 
     seconds: float
@@ -57,9 +62,10 @@ class BothWays:
 
 
 def everything(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
-    """A bake that leaves out neither an output nor code for textures, holes and gloss."""
-    prepared = prepare(scene, spec.model_copy(update={"outputs": OUTPUTS}), find)
-    return replace(prepared, tracer=prepared.tracer.general(scene))
+    """A bake that leaves out no output, no probe that stands outside solids, no environment, nor code for textures, holes and gloss."""
+    prepared = prepare(scene, spec.model_copy(update={"outputs": OUTPUTS, "receivers": "everywhere"}), find)
+    whole = prepared.whole.general(scene)
+    return replace(prepared, tracer=whole, whole=whole)
 
 
 def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> BothWays:
@@ -70,10 +76,14 @@ def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -
     SpecError, SceneError
         As a bake would.
     """
-    return BothWays(_bake(prepare(scene, spec, find), threads), _bake(everything(scene, spec, find), threads))
+    without, ours = _bake(prepare(scene, spec, find), threads)
+    with_all, theirs = _bake(everything(scene, spec, find), threads)
+    # Of probes that one bake has and the other has not there is nothing to compare.
+    kept = [(a.states == 1) & (b.states == 1) for a, b in zip(ours, theirs, strict=True)]
+    return BothWays(replace(without, digests=_digests(ours, kept)), replace(with_all, digests=_digests(theirs, kept)))
 
 
-def _bake(prepared: Prepared, threads: int) -> Way:
+def _bake(prepared: Prepared, threads: int) -> tuple[Way, tuple[VolumeData, ...]]:
     compile_kernels(prepared, audited=False)
     check_finite(prepared, threads=threads)
     clock, run = Clock(prepared.spec, None), Run(threads, 1)
@@ -82,10 +92,16 @@ def _bake(prepared: Prepared, threads: int) -> Way:
     with tempfile.TemporaryDirectory(prefix="octobake-both-ways-") as folder:
         manifest = finish(prepared, state, run, Path(folder) / "bundle", audit_seconds=0)
         volumes = read_bundle(Path(folder) / "bundle").volumes
-    return Way(
-        seconds=seconds,
-        bytes=sum(entry["bytes"] for entry in manifest["files"].values()),
-        samples=state.samples,
-        error=state.error(),
-        digests={f"{v.name}.{x.output}": sha256(x.texels.tobytes()).hexdigest() for v in volumes for x in v.atlases.values()},
-    )
+    size = sum(entry["bytes"] for entry in manifest["files"].values())
+    return Way(seconds, size, state.samples, state.error(), {}), volumes
+
+
+def _digests(volumes: Sequence[VolumeData], kept: Sequence[NDArray[np.bool_]]) -> dict[str, str]:
+    """By ``volume.output``, of the maps of some probes."""
+    out = {}
+    for volume, some in zip(volumes, kept, strict=True):
+        active = volume.states == 1
+        for a in volume.atlases.values():
+            maps = unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(active.sum()))
+            out[f"{volume.name}.{a.output}"] = sha256(maps[some[active]].tobytes()).hexdigest()
+    return out

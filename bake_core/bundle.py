@@ -35,7 +35,7 @@ class Atlas:
     Attributes
     ----------
     output : str
-        ``irradiance``, ``visibility``, ``radiance``, ``distance`` or ``normal``.
+        ``irradiance``, ``visibility``, ``walls``, ``radiance``, ``distance`` or ``normal``.
     texels : (layers, rows * tile, columns * tile, channels) float32
     tile, interior : int
         Texels along a tile's side with its border (interior + 2) and without.
@@ -68,7 +68,7 @@ class VolumeData:
         Metres, world.
     counts : (3,) int64
     states : (n,) uint8
-        1 active; 0 inside geometry: no tile, weight 0 in every query.
+        1 active; 0 inside geometry, 2 needed by no surface: no tile, weight 0 in every query.
     offsets : (n, 3) float32
         Metres from the lattice point to where the probe stands.
     backface : (n,) float32
@@ -120,6 +120,7 @@ MANIFEST = "manifest.json"
 CHANNELS = {
     "irradiance": ("R", "G", "B"),
     "visibility": ("mean", "square"),
+    "walls": ("inverse",),
     "radiance": ("R", "G", "B"),
     "distance": ("distance",),
     "normal": ("x", "y", "z"),

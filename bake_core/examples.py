@@ -173,21 +173,42 @@ def square_emitter_irradiance(radiance: float = 1.0) -> float:
     return radiance * 4 * x * math.atan(x)
 
 
-def two_rooms(albedo: float = 0.7) -> Example:
+def two_rooms(albedo: float = 0.7, scale: float = 1.0) -> Example:
     """Two sealed rooms of 4 × 3 × 4 m beside each other, a wall of 2 cm between them; a lamp in the left one's ceiling.
 
     The rooms are x in [-4.01, -0.01] and [0.01, 4.01], y in [0, 3], z in [-2, 2]. In the right one every irradiance is exactly 0.
-    The probes (8 × 3 × 4, 1 m apart) stand half a metre from the walls, none in the wall between.
+    The probes (8 × 3 × 4, 1 m apart) stand half a metre from the walls, none in the wall between. All lengths are times `scale`.
     """
     w = GlbWriter()
     wall = w.material("wall", (albedo,) * 3)
     lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(10.0, 10.0, 10.0))
     glow = _horizontal((-2.51, -1.51), (-0.5, 0.5), 2.98, up=False)
-    lit = w.mesh("lit room", [quads_part(box_sides((-4.01, 0, -2), (-0.01, 3, 2)), wall), quads_part([glow], lamp)])
-    dark = w.mesh("dark room", [quads_part(box_sides((0.01, 0, -2), (4.01, 3, 2)), wall)])
+    left, right = box_sides((-4.01, 0, -2), (-0.01, 3, 2)), box_sides((0.01, 0, -2), (4.01, 3, 2))
+    lit = w.mesh("lit room", [quads_part([q * scale for q in left], wall), quads_part([glow * scale], lamp)])
+    dark = w.mesh("dark room", [quads_part([q * scale for q in right], wall)])
     w.node("lit room", mesh=lit)
     w.node("dark room", mesh=dark)
-    w.node("lit", camera=w.camera(math.radians(70)), matrix=look_at((-3.8, 1.6, 1.8), (-0.5, 1.2, -1.0)))
-    w.node("dark", camera=w.camera(math.radians(70)), matrix=look_at((3.8, 1.6, 1.8), (0.5, 1.2, -1.0)))
-    grid = {"name": "rooms", "origin": [-3.5, 0.5, -1.5], "spacing": [1.0, 1.0, 1.0], "counts": [8, 3, 4]}
+    for name, eye, target in (("lit", (-3.8, 1.6, 1.8), (-0.5, 1.2, -1.0)), ("dark", (3.8, 1.6, 1.8), (0.5, 1.2, -1.0))):
+        w.node(name, camera=w.camera(math.radians(70)), matrix=look_at([x * scale for x in eye], [x * scale for x in target]))
+    origin, spacing = [-3.5 * scale, 0.5 * scale, -1.5 * scale], [scale] * 3
+    return w.to_glb(), {"version": 1, "volumes": [{"name": "rooms", "origin": origin, "spacing": spacing, "counts": [8, 3, 4]}]}
+
+
+def tunnel() -> Example:
+    """Two galleries of 2 × 2.4 × 14 m beside each other, a wall of 5 cm between them that ends in a gallery across; a lamp near one's end.
+
+    The first is x in [-2.025, -0.025], the second its mirror image, the one across z in [14, 16]; light comes to the second round the bend
+    alone, and falls over its length to a hundredth. The probes (4 × 3 × 16, 1 m apart) stand off the middle of everything.
+    """
+    w = GlbWriter()
+    stone = w.material("stone", (0.7, 0.66, 0.6))
+    lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(20.0, 18.0, 14.0))
+    first, second = box_sides((-2.025, 0, 0), (-0.025, 2.4, 14)), box_sides((0.025, 0, 0), (2.025, 2.4, 14))
+    across = box_sides((-2.025, 0, 14), (2.025, 2.4, 16))
+    # Where galleries meet there is no side; of the wall between them, the narrow one.
+    end = np.array([[-0.025, 0, 14], [0.025, 0, 14], [0.025, 2.4, 14], [-0.025, 2.4, 14]], np.float64)
+    sides = first[:5] + second[:5] + across[:4] + across[5:] + [end]
+    glow = _horizontal((-1.4, -0.8), (1.0, 3.0), 2.38, up=False)
+    w.node("tunnel", mesh=w.mesh("tunnel", [quads_part(sides, stone), quads_part([glow], lamp)]))
+    grid = {"name": "tunnel", "origin": [-1.6, 0.45, 0.3], "spacing": [1.0, 1.0, 1.0], "counts": [4, 3, 16]}
     return w.to_glb(), {"version": 1, "volumes": [grid]}

@@ -25,7 +25,6 @@ from bake_core.allocation import FULL, HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.assemble import assemble
 from bake_core.cubemaps import FACES, cube_directions, octahedral_radiance, octahedral_surfaces
 from bake_core.errors import InputError, MachineError
-from bake_core.filtering import visibility_moments
 from bake_core.images import read_exr
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.placement import Volume
@@ -33,6 +32,7 @@ from bake_core.report import Run
 from bake_core.selection import Selection
 from bake_core.spec import OUTPUTS, Spec, parse_spec
 from bake_core.tally import State
+from bake_core.walls import moments_and_walls
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -108,14 +108,15 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
     # As a bake chooses it: a power of two above any distance.
     miss = 2.0 ** math.ceil(math.log2(4 * max(longest, 1e-6)))
     state.distance[~np.isfinite(state.distance)] = miss
+    offsets = np.zeros((len(state.backface), 3), np.float32)
     sides = {"irradiance": r.irradiance, "visibility": r.visibility, "distance": r.distance, "normal": r.normal}
-    selection = Selection(OUTPUTS, (), capture=radiance, miss_distance=miss, **sides)
+    selection = Selection(OUTPUTS, (False,) * len(volumes), (), capture=radiance, miss_distance=miss, **sides)
     source = _Source(f"sha256:{digest.hexdigest()}", 0, ())
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as work:
             target = Path(work) / "bundle"
             target.mkdir()
-            manifest = assemble(source, spec, volumes, selection, (), state, "samples", target) | {"samples": 0}
+            manifest = assemble(source, spec, volumes, offsets, selection, (), state, "samples", target) | {"samples": 0}
             written = bundle.dump_json(manifest)
             (target / bundle.MANIFEST).write_bytes(written)
             report.write(target, manifest, bundle.content_digest(written), Run(1, 1, stopped="samples"))
@@ -160,9 +161,10 @@ def _empty_state(n: int, spec: Spec, radiance: int) -> State:
         samples=HALVES,
         taken=np.ones((n, HALVES), np.int64),
         eighths=np.full((n, HALVES), FULL, np.int64),
+        needed=np.ones(n, np.bool_),
         irradiance=np.zeros((n, SCRAMBLES, r.irradiance**2, 3), np.float32),
         radiance=np.zeros((n, HALVES, radiance**2, 3), np.float32),
-        visibility=np.zeros((n, r.visibility, r.visibility, 2), np.float32),
+        visibility=np.zeros((n, r.visibility, r.visibility, 3), np.float32),
         backface=np.zeros(n, np.float32),
         distance=np.zeros((n, r.distance**2), np.float32),
         normal=np.zeros((n, r.normal**2, 3), np.float32),
@@ -203,4 +205,5 @@ def _fill(state: State, at: int, volume: Volume, spec: Spec, radiance: int, ligh
     distance, normal = octahedral_surfaces(distances[None], r.distance)
     state.distance[at] = distance[0]
     state.normal[at] = normal[0] if r.normal == r.distance else octahedral_surfaces(distances[None], r.normal)[1][0]
-    state.visibility[at] = visibility_moments(distance, np.array([volume.distance_limit]), r.visibility)[0]
+    limit, unit = np.array([volume.distance_limit]), np.array([volume.spacing.min()])
+    state.visibility[at] = moments_and_walls(distance, limit, unit, r.visibility)[0]

@@ -6,7 +6,7 @@ else is float64, so differences from GLSL are GLSL's rounding (tests hold them t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bake_core.octahedral import dir_to_oct
-from bake_core.shader_constants import probe_texels, surface_bias
+from bake_core.placement import cover
+from bake_core.shader_constants import finest_first, probe_texels, surface_bias
 
 if TYPE_CHECKING:
     from bake_core.bundle import Atlas, VolumeData
@@ -37,17 +38,21 @@ class Samples:
     ----------
     irradiance : (n, 3) float64
         E, no 1/π inside; everything but the direct light of punctual and directional lights.
-    weights : (n, 8) float64
-        Of the probes around each point; they sum to 1, or are all 0 where every probe is inside geometry.
-    probes : (n, 8) int64
-        Flat indices of those probes within the volume. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
+    weights : (n, 8 k) float64
+        Of the probes around each point, eight for each of the volumes that answer, k being the most that do for any point. They sum to 1,
+        or to less where none of a volume's is active.
+    probes : (n, 8 k) int64
+        Flat indices of those probes within their volumes. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
+    volumes : (n, 8 k) int64
+        Indices of their volumes.
     volume : (n,) int64
-        Index of the volume that answered.
+        Index of the finest volume around each point; of the nearest one where none is.
     """
 
     irradiance: F64
     weights: F64
     probes: I64
+    volumes: I64
     volume: I64
 
 
@@ -72,30 +77,58 @@ def sample(
     positions = np.asarray(positions, np.float64).reshape(-1, 3)
     normals = np.asarray(normals, np.float64).reshape(-1, 3)
     wo, toward = (normals if d is None else np.asarray(d, np.float64).reshape(-1, 3) for d in (wo, toward))
-    chosen = select_volume(volumes, positions)
-    out = Samples(np.zeros((len(positions), 3)), np.zeros((len(positions), 8)), np.zeros((len(positions), 8), np.int64), chosen)
-    for v, volume in enumerate(volumes):
+    n, chosen, shares = len(positions), select_volume(volumes, positions), volume_shares(volumes, positions)
+    # One at least: there may be no points.
+    k = int((shares > 0).sum(0).max(initial=1))
+    weights, probes, owners = np.zeros((n, k, 8)), np.zeros((n, k, 8), np.int64), np.repeat(chosen, 8 * k).reshape(n, k, 8)
+    irradiance, slot = np.zeros((n, 3)), np.zeros(n, np.int64)
+    for v in finest_first(volumes):
+        volume = volumes[v]
         table = probe_texels(volume).reshape(-1, 4).astype(np.float64)
-        of_volume = np.flatnonzero(chosen == v)
+        of_volume = np.flatnonzero(shares[v] > 0)
         for first in range(0, len(of_volume), CHUNK):
             at = of_volume[first : first + CHUNK]
-            out.irradiance[at], out.weights[at], out.probes[at] = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
+            light, part, around = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
+            irradiance[at] += shares[v, at, None] * light
+            weights[at, slot[at]], probes[at, slot[at]], owners[at, slot[at]] = shares[v, at, None] * part, around, v
+        slot[of_volume] += 1
+    return Samples(irradiance, weights.reshape(n, 8 * k), probes.reshape(n, 8 * k), owners.reshape(n, 8 * k), chosen)
+
+
+def volume_shares(volumes: Sequence[VolumeData], positions: F64) -> F64:
+    """How much each volume's answer counts at each point, (volumes, n) float64; they sum to 1. Mirrors the loop of ``obIrradianceToward``.
+
+    A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the
+    rest to the next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest
+    has.
+    """
+    shares, rest = np.zeros((len(volumes), len(positions))), np.ones(len(positions))
+    nearest = select_volume(volumes, positions)
+    for v in finest_first(volumes):
+        volume = volumes[v]
+        beyond = (_beyond(volume, positions) / (0.5 * volume.spacing)).max(-1)
+        # So little for the nearest counts only where it is alone.
+        reach = np.maximum(1 - np.minimum(beyond, 1), np.where(nearest == v, 1e-20, 0))
+        shares[v] = rest * reach
+        rest = rest * (1 - reach)
+    out: F64 = shares / shares.sum(0)
     return out
 
 
 def select_volume(volumes: Sequence[VolumeData], positions: F64) -> I64:
-    """Index of the first volume that contains each point, the nearest one where none does. Mirrors ``obSelectVolume``.
-
-    An axis with one probe reaches half a spacing to both sides.
-    """
-    squared = np.empty((len(volumes), len(positions)))
-    for v, volume in enumerate(volumes):
-        margin = np.where(volume.counts == 1, 0.5, 0.0) * volume.spacing
-        p = positions - volume.origin
-        d = np.maximum(np.maximum(-margin - p, p - (volume.counts - 1) * volume.spacing - margin), 0)
-        squared[v] = (d * d).sum(-1)
-    nearest: I64 = squared.argmin(0).astype(np.int64)
+    """Index of the finest volume that contains each point, of the nearest one where none does. Mirrors ``obSelectVolume``."""
+    order = np.array(finest_first(volumes), np.int64)
+    squared = np.stack([(_beyond(volumes[v], positions) ** 2).sum(-1) for v in order])
+    nearest: I64 = order[squared.argmin(0)]
     return nearest
+
+
+def _beyond(volume: VolumeData, positions: F64) -> F64:
+    """How far outside of a volume's box points are along each axis, (n, 3); an axis with one probe reaches half a spacing to both sides."""
+    margin = np.where(volume.counts == 1, 0.5, 0.0) * volume.spacing
+    p = positions - volume.origin
+    out: F64 = np.maximum(np.maximum(-margin - p, p - (volume.counts - 1) * volume.spacing - margin), 0)
+    return out
 
 
 def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.bool_]:
@@ -108,16 +141,8 @@ def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.b
     for volume in volumes:
         last = volume.origin + volume.spacing * (np.asarray(volume.counts) - 1)
         beyond = np.maximum(volume.origin - positions, positions - last)
-        out |= (beyond <= cover(volume)).all(-1)
+        out |= (beyond <= cover(volume.spacing)).all(-1)
     return out
-
-
-def cover(volume: VolumeData) -> float:
-    """How far beyond its outermost probes a volume answers for points, metres.
-
-    Half of its longest spacing: along that side, its cells answer for points as far from their probes.
-    """
-    return float(volume.spacing.max()) / 2
 
 
 def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
@@ -138,10 +163,35 @@ def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
 
 def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64, toward: F64) -> tuple[F64, F64, I64]:
     """Mirrors ``obIrradianceInVolume``: irradiance, weights and probes; `table` is the volume's probe table, one row a probe."""
-    n = len(positions)
-    base, fraction = cell(volume, positions)
     normal_bias, view_bias = surface_bias(volume)
     biased = positions + normals * normal_bias + wo * view_bias
+
+    def weigh(tile: I64, probe: F64) -> F64:
+        return crush(facing(probe - positions, normals) * _visibility(volume, tile, biased - probe))
+
+    return blend(volume, table, positions, toward, weigh)
+
+
+def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Callable[[I64, F64], F64]) -> tuple[F64, F64, I64]:
+    """Irradiance of the eight probes around points, by trilinear weights times others.
+
+    Parameters
+    ----------
+    table : (n, 4) float64
+        The volume's probe table.
+    positions, toward : (m, 3) float64
+    weigh : callable
+        Of tiles (m,) and of where their probes stand (m, 3) the other weights, (m,).
+
+    Returns
+    -------
+    irradiance : (m, 3) float64
+    weights : (m, 8) float64
+        Of the corners; they sum to 1, or are all 0.
+    probes : (m, 8) int64
+    """
+    n = len(positions)
+    base, fraction = cell(volume, positions)
     oct_toward = dir_to_oct(toward)
     probes = np.empty((n, 8), np.int64)
     trilinear, other, light = np.empty((n, 8)), np.empty((n, 8)), np.empty((n, 8, 3))
@@ -149,17 +199,15 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
         upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
         lattice = np.minimum(base + upper, volume.counts - 1)
         probe = lattice @ np.array([1, volume.counts[0], volume.counts[0] * volume.counts[1]])
-        position = volume.origin + volume.spacing * lattice + table[probe, :3]
         kept = table[probe, 3] > 0
         # A probe without a tile reads the first one, and counts for nothing.
         tile = np.where(kept, table[probe, 3] - 1, 0).astype(np.int64)
-        weight = _facing(position - positions, normals) * _visibility(volume, tile, biased - position)
         probes[:, corner] = probe
-        other[:, corner] = _crush(weight) * kept
+        other[:, corner] = weigh(tile, volume.origin + volume.spacing * lattice + table[probe, :3]) * kept
         trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
         light[:, corner] = bilinear(volume.atlases["irradiance"], tile, oct_toward)
     weights = trilinear * other
-    # Where nothing is left, the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
+    # Where nothing is left, the point stands on a probe, an edge or a face of the grid none of whose probes is active.
     weights = np.where(weights.sum(-1, keepdims=True) > 0, weights, other)
     total = weights.sum(-1, keepdims=True)
     weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
@@ -196,7 +244,7 @@ def bilinear(atlas: Atlas, tile: I64, oct_xy: NDArray[np.floating]) -> F64:
     return out
 
 
-def _facing(to_probe: F64, normals: F64) -> F64:
+def facing(to_probe: F64, normals: F64) -> F64:
     """Mirrors ``obFacing``."""
     wrap = 0.5 + 0.5 * (to_probe * normals).sum(-1) / np.maximum(np.linalg.norm(to_probe, axis=-1), 1e-20)
     out: F64 = wrap * wrap + FACING_FLOOR
@@ -206,19 +254,19 @@ def _facing(to_probe: F64, normals: F64) -> F64:
 def _visibility(volume: VolumeData, tile: I64, from_probe: F64) -> F64:
     """Mirrors ``obVisibility``."""
     out = np.ones(len(tile))
-    r = np.minimum(np.linalg.norm(from_probe, axis=-1), volume.distance_limit)
-    atlas = volume.atlases.get("visibility")
+    r = np.linalg.norm(from_probe, axis=-1)
+    atlas = volume.atlases.get("walls")
     if atlas is None:
         return out
     apart = np.flatnonzero(r > 0)
-    mean, square = bilinear(atlas, tile[apart], dir_to_oct(from_probe[apart])).T
-    beyond = r[apart] - mean
-    variance = np.maximum(square - mean * mean, 1e-5 * square)
-    bound = variance / np.maximum(variance + beyond * beyond, 1e-37)
-    out[apart] = np.where(beyond > 0, np.maximum(bound**3, volume.parameters["visibility_floor"]), 1)
+    reach = np.abs(from_probe[apart]).sum(-1) * np.minimum(1, volume.distance_limit / r[apart]) / volume.spacing.min()
+    behind = bilinear(atlas, tile[apart], dir_to_oct(from_probe[apart]))[:, 0] * reach - 1
+    soft = volume.parameters["visibility_softness"] ** 2
+    bound = soft / (soft + behind * behind)
+    out[apart] = np.where(behind > 0, np.maximum(bound**3, volume.parameters["visibility_floor"]), 1)
     return out
 
 
-def _crush(weight: F64) -> F64:
+def crush(weight: F64) -> F64:
     """Mirrors ``obCrush``."""
     return np.where(weight < CRUSH_THRESHOLD, weight**3 / CRUSH_THRESHOLD**2, weight)

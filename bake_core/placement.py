@@ -23,6 +23,14 @@ _TURNED = 1e-4
 DISTANCE_LIMIT_DIAGONALS = 1.5
 
 
+def cover(spacing: F64) -> float:
+    """How far beyond its outermost probes a volume answers for points, metres.
+
+    Half of its longest spacing: along that side, its cells answer for points as far from their probes.
+    """
+    return float(spacing.max()) / 2
+
+
 @dataclass(frozen=True)
 class Volume:
     """A grid of probes: probe (i, j, k) stands at origin + (i, j, k) * spacing, flat index i + nx * (j + ny * k).
@@ -48,6 +56,12 @@ class Volume:
     def distance_limit(self) -> float:
         """1.5 × the cell's diagonal, metres."""
         return DISTANCE_LIMIT_DIAGONALS * float(np.linalg.norm(self.spacing))
+
+    @property
+    def reach(self) -> tuple[F64, F64]:
+        """Lowest and highest corner, (3,) float64 each, world, of the box for whose points the volume answers as well as it can."""
+        grown = cover(self.spacing)
+        return self.origin - grown, self.origin + (np.asarray(self.counts) - 1) * self.spacing + grown
 
     def positions(self) -> F64:
         """(n, 3) float64, world, in flat order."""

@@ -47,13 +47,13 @@ class _Map:
         if self.source in CHAINS:
             return volume_chain(volume, self.source)
         # A map that the bundle left out is never looked at.
-        return volume.atlases[self.source].texels if self.source in volume.atlases else np.zeros((1, 1, 1, 2), np.float32)
+        return volume.atlases[self.source].texels if self.source in volume.atlases else np.zeros((1, 1, 1, 1), np.float32)
 
     def shape(self, volume: VolumeData) -> tuple[int, ...]:
         return chain_shape(volume, self.source) if self.source in CHAINS else self.texels(volume).shape
 
 
-_DIFFUSE = (_Map("irradiance", "vec3", "rgb", True), _Map("visibility", "vec2", "rg", True), _Map("probes", "vec4", "rgba", False))
+_DIFFUSE = (_Map("irradiance", "vec3", "rgb", True), _Map("walls", "float", "r", True), _Map("probes", "vec4", "rgba", False))
 _GLOSSY = (
     _Map("distance", "float", "r", False),
     _Map("normal", "vec3", "rgb", False),
@@ -68,7 +68,7 @@ def _maps(volumes: Sequence[VolumeData]) -> tuple[_Map, ...]:
 
 
 def probe_textures(device: Device, volumes: Sequence[VolumeData]) -> list[Image]:
-    """Irradiance, visibility and the probe tables of all volumes; and what rays are traced through, where they have it."""
+    """Irradiance, walls and the probe tables of all volumes; and what rays are traced through, where they have it."""
     return [texture(device, _stacked([_four(m.texels(v)) for v in volumes]), linear=m.linear) for m in _maps(volumes)]
 
 

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 from bake_core.bundle import VolumeData
 from bake_core.embree import new_rayhit
 from bake_core.errors import Cancelled
-from bake_core.irradiance import cover
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.materials import sample_lambert
+from bake_core.placement import cover
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.scene import Scene
 from bake_core.surface_sampling import Places, SurfaceSampler
@@ -101,7 +101,7 @@ def volume_boxes(volumes: Sequence[VolumeData]) -> F64:
     """Where a bundle's light can be held against the truth, (v, 2, 3), world: as :func:`bake_core.irradiance.covered` has it."""
     boxes = []
     for v in volumes:
-        reach = cover(v) + _SLACK * v.spacing
+        reach = cover(v.spacing) + _SLACK * v.spacing
         boxes.append([v.origin - reach, v.origin + (v.counts - 1) * v.spacing + reach])
     return np.array(boxes).reshape(-1, 2, 3)
 

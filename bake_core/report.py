@@ -101,8 +101,6 @@ def _page(manifest: dict[str, Any], document: dict[str, Any], run: Run, plot: st
         (v["name"], a["output"], a["encoding"], percent(a["encoding_error"]), a["file"] or "none: constant")
         for v in manifest["volumes"]
         for a in v["atlases"]
-        for v in manifest["volumes"]
-        for a in v["atlases"]
     ]
     curve = [(p["samples"], f"{p['rays']:,}", f"{p['seconds']:.2f}", percent(p["error"])) for p in document["curve"]]
     fitted = [(f"against {name}", in_words(rate)) for name, rate in zip(("samples", "seconds of tracing"), run.rates(), strict=True)]
@@ -142,6 +140,15 @@ def _samples(manifest: dict[str, Any]) -> str:
     if mean >= manifest["samples"] or uniform is None:
         return str(manifest["samples"])
     return f"{manifest['samples']} at most, {mean:.0f} on average; the same error takes {uniform:.0f} if every probe gets as many"
+
+
+def audit_of(report: dict[str, Any]) -> Audit | None:
+    """The audit in a ``report.json``, as it was written from."""
+    told = report.get("audit")
+    if told is None:
+        return None
+    texels = {output: Figures(**figures) for output, figures in told["texels"].items()}
+    return Audit(**{**told, "texels": texels, "surfaces": None if told["surfaces"] is None else Figures(**told["surfaces"])})
 
 
 def audit_in_words(audit: Audit) -> str:

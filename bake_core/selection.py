@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bake_core.occlusion import nothing_occludes
+from bake_core.placement import Volume
+from bake_core.reach import reach_box, triangles_meeting
 from bake_core.scene import NO_TEXTURE, Scene
 from bake_core.spec import OUTPUTS, OutputName, Spec
 
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
 _CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
-# Of a texel as it is usually stored: halves of three colours, floats of two moments, one float, halves of a vector.
-_TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 8, "radiance": 6, "distance": 4, "normal": 6}
+# Of a texel as it is usually stored: halves of three colours, floats of two moments and half a float of the walls, one float, halves of a
+# vector.
+_TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 10, "radiance": 6, "distance": 4, "normal": 6}
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,8 @@ class Selection:
     ----------
     outputs : tuple of str
         What the bundle holds, in DESIGN's order.
+    seen : tuple of bool
+        By volume: whether its probes see all that they light, so that it has no visibility maps.
     left_out : tuple of LeftOut
         Outputs, with what they would have taken.
     capture : int
@@ -55,6 +63,7 @@ class Selection:
     """
 
     outputs: tuple[OutputName, ...]
+    seen: tuple[bool, ...]
     left_out: tuple[LeftOut, ...]
     capture: int
     irradiance: int
@@ -66,6 +75,10 @@ class Selection:
     def keeps(self, output: OutputName) -> bool:
         return output in self.outputs
 
+    def of(self, volume: int) -> tuple[OutputName, ...]:
+        """What one volume has of them."""
+        return tuple(o for o in self.outputs if o != "visibility" or not self.seen[volume])
+
     def map_bytes(self, output: OutputName) -> int:
         """What one probe's map takes before compression, border included."""
         sides = {"radiance": self.capture, "irradiance": self.irradiance, "visibility": self.visibility}
@@ -73,36 +86,64 @@ class Selection:
         return (side + 2) ** 2 * _TEXEL_BYTES[output]
 
 
-def select(scene: Scene, spec: Spec, probes: int) -> Selection:
-    """Choose outputs: what the spec demands, or what the scene's materials can make use of.
+def select(scene: Scene, spec: Spec, volumes: Sequence[Volume]) -> Selection:
+    """Choose outputs: what the spec demands, or what the scene can make use of.
 
     Parameters
     ----------
-    probes : int
-        Of all volumes together.
+    volumes : sequence of Volume
+        The spec's, placed.
     """
-    used = np.unique(scene.triangle_material)
     m = scene.materials
     # A metal of roughness 1 reflects as broadly as a matt surface does: its light is looked up in irradiance maps, too.
-    glossy = bool(((m.roughness < 1) | (m.metallic_roughness_texture != NO_TEXTURE))[used].any())
-    if spec.outputs == "auto":
-        kept: tuple[OutputName, ...] = OUTPUTS if glossy else ("irradiance", "visibility")
-        why = "no material is glossy (roughness below 1), so nothing reflects single directions"
+    shiny = (m.roughness < 1) | (m.metallic_roughness_texture != NO_TEXTURE)
+    glossy = bool(shiny[np.unique(scene.triangle_material)].any())
+    reflects = glossy and any(_holds(scene, volume, shiny) for volume in volumes)
+    auto = spec.outputs == "auto"
+    # The proof is of probes on their lattice.
+    seen = tuple(auto and spec.probes == "lattice" and nothing_occludes(scene, volume) for volume in volumes)
+    if auto:
+        kept = tuple(o for o in OUTPUTS if o == "irradiance" or (not all(seen) if o == "visibility" else reflects))
     else:
         kept = tuple(o for o in OUTPUTS if o in spec.outputs)
-        why = "not in the spec's outputs"
     size = scene.bounds[1] - scene.bounds[0]
     # A power of two above four diagonals, so that the value says of itself that it is no measurement.
     miss = 2.0 ** math.ceil(math.log2(4 * max(float(np.linalg.norm(size)), 1e-6)))
     r = spec.resolution
     chosen = Selection(
         outputs=kept,
+        seen=seen,
         left_out=(),
-        capture=r.radiance or (_CAPTURE_GLOSSY if glossy else _CAPTURE_DIFFUSE),
+        capture=r.radiance or (_CAPTURE_GLOSSY if reflects else _CAPTURE_DIFFUSE),
         irradiance=r.irradiance,
         visibility=r.visibility,
         distance=r.distance,
         normal=r.normal,
         miss_distance=miss,
     )
-    return replace(chosen, left_out=tuple(LeftOut(o, why, probes * chosen.map_bytes(o)) for o in OUTPUTS if o not in kept))
+    return replace(chosen, left_out=tuple(_left_out(chosen, volumes, auto, glossy)))
+
+
+def _holds(scene: Scene, volume: Volume, materials: NDArray[np.bool_]) -> bool:
+    """Whether any triangle of some materials may lie within a volume's reach."""
+    return any(True for _ in triangles_meeting(scene, reach_box(scene, volume), materials))
+
+
+def _left_out(chosen: Selection, volumes: Sequence[Volume], auto: bool, glossy: bool) -> Iterator[LeftOut]:
+    """Outputs that are not kept, why, and what they would have taken."""
+    probes = [v.probe_count for v in volumes]
+    directions = "no material is glossy (roughness below 1), so nothing reflects single directions"
+    if glossy:
+        directions = "no surface within the volumes' reach is glossy (roughness below 1), so nothing there reflects single directions"
+    for output in OUTPUTS:
+        size = chosen.map_bytes(output)
+        if output == "visibility" and auto:
+            why = "nothing can stand between a probe and a surface: every triangle in reach has all of both on one side"
+            if all(chosen.seen):
+                yield LeftOut(output, why, sum(probes) * size)
+            else:
+                for volume, count, seen in zip(volumes, probes, chosen.seen, strict=True):
+                    if seen:
+                        yield LeftOut(f"{volume.name}: {output}", why, count * size)
+        elif output not in chosen.outputs:
+            yield LeftOut(output, directions if auto else "not in the spec's outputs", sum(probes) * size)

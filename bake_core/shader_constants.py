@@ -6,7 +6,7 @@ Mirrors the struct ``ObVolume`` in ``shaders/grid.glsl`` field by field.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,10 +35,19 @@ def surface_bias(volume: VolumeData) -> tuple[float, float]:
     normal_bias, view_bias : float
         Metres.
     """
-    p = volume.parameters
-    several = volume.spacing[volume.counts > 1]
-    scale = p["bias_scale"] * float(several.min() if several.size else volume.spacing.min())
-    return p["normal_bias"] * scale, p["view_bias"] * scale
+    return biases(volume.parameters, volume.spacing, volume.counts)
+
+
+def biases(parameters: Mapping[str, float], spacing: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[float, float]:
+    """As :func:`surface_bias`, of a volume that is not baked yet."""
+    several = spacing[counts > 1]
+    scale = parameters["bias_scale"] * float(several.min() if several.size else spacing.min())
+    return parameters["normal_bias"] * scale, parameters["view_bias"] * scale
+
+
+def finest_first(volumes: Sequence[VolumeData]) -> list[int]:
+    """Indices of volumes by the size of their cells, the smallest first; of equal ones the first in the spec."""
+    return sorted(range(len(volumes)), key=lambda v: float(volumes[v].spacing.prod()))
 
 
 def bundle_constants(volumes: Sequence[VolumeData], frame: ArrayLike = (0.0, 0.0, 0.0)) -> str:
@@ -62,6 +71,8 @@ def bundle_constants(volumes: Sequence[VolumeData], frame: ArrayLike = (0.0, 0.0
     fields = [_light_field(v) for v in volumes]
     others = "".join(f"    if (v == {i}) field = {row};\n" for i, row in enumerate(fields) if row != fields[0])
     rounds = sum(int(v.counts.sum()) for v in volumes)
+    order = finest_first(volumes)
+    ranks = "".join(f"    if (rank == {rank}) v = {v};\n" for rank, v in enumerate(order) if rank)
     # Not an array: indexed by a variable, an array of structs is copied for each invocation by some drivers, and lavapipe takes minutes
     # to compile one of 64.
     return (
@@ -70,7 +81,9 @@ def bundle_constants(volumes: Sequence[VolumeData], frame: ArrayLike = (0.0, 0.0
         "// Most cells that a ray crosses.\n"
         f"const int OB_ROUNDS = {rounds};\n\n"
         f"ObVolume obVolume(int v) {{\n    ObVolume volume = {rows[0][0]}; // {rows[0][1]}\n{choices}    return volume;\n}}\n\n"
-        f"ObLightField obLightField(int v) {{\n    ObLightField field = {fields[0]};\n{others}    return field;\n}}\n"
+        f"ObLightField obLightField(int v) {{\n    ObLightField field = {fields[0]};\n{others}    return field;\n}}\n\n"
+        "// Volumes by the size of their cells, the smallest first.\n"
+        f"int obFinest(int rank) {{\n    int v = {order[0]};\n{ranks}    return v;\n}}\n"
     )
 
 
@@ -106,10 +119,12 @@ def _volume(volume: VolumeData, frame: NDArray[np.float64]) -> str:
         _vector("ivec3", map(str, volume.counts)),
         _vector("ivec2", map(str, tiles)),
         str(texels.get("irradiance", 0)),
-        str(texels.get("visibility", 0)),
+        str(texels.get("walls", 0)),
+        _float(volume.spacing.min()),
         _float(volume.distance_limit),
         _float(normal_bias),
         _float(view_bias),
+        _float(volume.parameters["visibility_softness"]),
         _float(volume.parameters["visibility_floor"]),
     ]
     return _vector("ObVolume", fields)

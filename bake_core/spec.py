@@ -167,6 +167,8 @@ class Spec(_Model):
     environment: Environment = ConstantEnvironment()
     lights: Annotated[tuple[Light, ...], Field(max_length=65536)] = ()
     outputs: Literal["auto"] | Annotated[tuple[OutputName, ...], Field(min_length=1)] = "auto"
+    receivers: Literal["everywhere", "surfaces"] = "everywhere"
+    probes: Literal["lattice", "relocated"] = "lattice"
     resolution: Resolution = Resolution()
     max_bounces: Annotated[Whole, Field(ge=0, le=MAX_BOUNCES)] | None = None
     stop: Stop = Stop()

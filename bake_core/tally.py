@@ -26,7 +26,8 @@ I64 = NDArray[np.int64]
 class Tally(Stored):
     """One shard's part of one pass.
 
-    Of a probe inside a solid only `backface` is known: the k probes of sums and maps are the shard's active ones, in order.
+    Of a probe inside a solid only `backface` is known, of one that is not needed nothing: the k probes of sums and maps are the shard's
+    active ones, in order.
 
     Attributes
     ----------
@@ -40,8 +41,8 @@ class Tally(Stored):
         Sums.
     radiance : (k, HALVES, capture texels, 3) float32
         Sums, or (0, 0, 0, 0).
-    visibility : (k, v, v, 2) float32
-        Moments; of the first pass only, else (0, 0, 0, 0). So are the next three.
+    visibility : (k, v, v, 3) float32
+        Moments, and walls; of the first pass only, else (0, 0, 0, 0). So are the next three.
     backface : (p,) float32
     distance : (k, d²) float32 or (0, 0)
     normal : (k, n², 3) float32 or (0, 0, 0)
@@ -65,7 +66,7 @@ class Tally(Stored):
 
 @dataclass
 class State(Stored):
-    """Everything gathered so far, for all n probes; arrays as in :class:`Tally`, zeros for probes inside solids.
+    """Everything gathered so far, for all n probes; arrays as in :class:`Tally`, zeros for probes that are not active.
 
     Attributes
     ----------
@@ -73,11 +74,14 @@ class State(Stored):
         Of the probes that got most.
     eighths : (n, HALVES) int64
         How densely each probe's halves are sampled: :class:`bake_core.allocation.Allocation`.
+    needed : (n,) bool
+        Which probes are baked, if they stand outside solids.
     """
 
     samples: int
     taken: I64
     eighths: I64
+    needed: NDArray[np.bool_]
     irradiance: F32
     radiance: F32
     visibility: F32
@@ -106,7 +110,7 @@ class State(Stored):
             probes = slice(t.first_probe, t.end_probe)
             if first == 0:
                 self.backface[probes] = t.backface
-            kept = t.first_probe + np.flatnonzero(outside(self.backface[probes]))
+            kept = t.first_probe + np.flatnonzero(self.active()[probes])
             self.taken[probes] = t.taken
             self.irradiance[kept] += t.irradiance
             self.rays += t.rays
@@ -117,13 +121,13 @@ class State(Stored):
                     if getattr(self, name).size:
                         getattr(self, name)[kept] = getattr(t, name)
         if first == 0:
-            # Of what is inside a solid nothing is ever shown.
+            # Of what is inside a solid, or needed by nobody, nothing is ever shown.
             self.eighths[~self.active()] = 0
         self.samples = end
 
     def active(self) -> NDArray[np.bool_]:
-        """(n,) bool: probes that stand outside geometry."""
-        return outside(self.backface)
+        """(n,) bool: probes that are needed and stand outside geometry."""
+        return self.needed & outside(self.backface)
 
     @property
     def allocation(self) -> Allocation:

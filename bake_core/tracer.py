@@ -102,6 +102,10 @@ class Tracer:
             tables = tables._replace(emitters=emitter_table(scene, mean_emission(tables, scene)))
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
 
+    def without_environment(self) -> Tracer:
+        """The same scene in the dark: for those who are sealed off from it (:mod:`bake_core.sealed`)."""
+        return replace(self, tables=self.tables._replace(environment=np.zeros(3), sky=None))
+
     def general(self, scene: Scene) -> Tracer:
         """The same scene for kernels that know textures, holes and gloss, whether it has any or not: the same light, more slowly."""
         tables = self.tables._replace(

@@ -6,11 +6,16 @@ from bake_core.selection import LeftOut
 from bake_core.tracer import Tables
 
 
-def unneeded(tables: Tables) -> tuple[LeftOut, ...]:
+def unneeded(tables: Tables, *, sealed: bool = False) -> tuple[LeftOut, ...]:
     """All that tracing a scene needs no code for, in the order in which a path would come to it.
 
     Compiled out are textures, gloss and skies, each of which makes a path slower by being there; the rest is one test of a length that
     never changes, and costs nothing that can be measured (docs/method.md says how that was found).
+
+    Parameters
+    ----------
+    sealed : bool
+        Whether there is an environment that the tables do without, for no light of it gets to any probe.
     """
     t = tables
     found = []
@@ -22,14 +27,17 @@ def unneeded(tables: Tables) -> tuple[LeftOut, ...]:
         found.append(
             ("code for gloss", "every material in use has metallic 0 and roughness 1, which is exactly Lambert: no GGX is compiled in")
         )
-    if t.sky is None:
+    if t.sky is None and not sealed:
         found.append(
             (
                 "code for sky sampling",
                 "the environment is one colour, for which cosine sampling is ideal: no search of an image is compiled in",
             )
         )
-    if t.sky is None and not t.environment.any():
+    if sealed:
+        why = "it is sealed off: every probe stands inside an opaque surface without a gap"
+        found += [("code for sky sampling", why), ("code for environment", why)]
+    elif t.sky is None and not t.environment.any():
         found.append(("code for environment", "it is black: a path's last ray is not traced where nothing is emissive"))
     if not len(t.emitters.cdf):
         found.append(("code for emitter sampling", "no triangle is emissive: no ray is sent to one"))

@@ -24,6 +24,7 @@ from bake_core.errors import BundleError, InputError
 from bake_core.irradiance import covered
 from bake_core.picture import Picture, path_trace_picture
 from bake_core.progress import Progress, ProgressCallback
+from bake_core.published_weights import ddgi, trilinear
 from bake_core.raster import Rasterizer
 from bake_core.ray_radiance import measure_radiance
 from bake_core.receiver_comparison import compare_receivers, measure_receivers
@@ -300,6 +301,11 @@ def _receivers(
         scene, tracer, bundle.volumes, samples=paths, threads=threads, advance=advance, cancelled=cancelled
     )
     figures = compare_receivers(answers, estimates)
+    # What the same probes would have answered by others' weights.
+    others = {"trilinear": trilinear, "ddgi": ddgi}
+    beside = {
+        name: compare_receivers(ask(bundle.volumes, receivers.positions, receivers.normals), estimates) for name, ask in others.items()
+    }
     columns = {"position": receivers.positions, "normal": receivers.normals, "irradiance": answers, "reference": estimates.mean(0)}
     rows = [{key: column[i].tolist() for key, column in columns.items()} for i in range(len(receivers))]
     (work / RECEIVERS).write_bytes(dump_json(rows))
@@ -308,6 +314,7 @@ def _receivers(
         "left_out": {"behind": receivers.behind, "unseen": receivers.unseen},
         "samples": paths,
         **asdict(figures),
+        "beside": {name: {"mean_ratio": f.mean_ratio, "relmse": f.relmse, "p95": f.p95} for name, f in beside.items()},
         "failures": thresholds.receivers.failures(figures),
         "seconds": time.perf_counter() - begun,
     }

@@ -19,6 +19,8 @@ F32 = NDArray[np.float32]
 EXPOSED = 0.97
 # Of the reference (or of its mean, where that is less): the relative difference that the difference picture shows at full colour.
 FULL_DIFFERENCE = 0.5
+# Ways to weigh the same probes, in the receivers' part.
+BESIDE = {"trilinear": "plain trilinear", "ddgi": "DDGI's weights"}
 PARTS = ("whole", "indirect")
 
 
@@ -108,9 +110,12 @@ def _receivers(figures: dict[str, Any]) -> str:
     return (
         f"<h2>Irradiance at {figures['count']} surface points</h2><table><tr><th></th>"
         + "".join(f"<th>{title}</th>" for title, _ in columns)
-        + "</tr><tr><th>receivers</th>"
-        + "".join(f"<td>{number(figures[key])}</td>" for _, key in columns)
-        + f"</tr></table><ul class=bad>{failures}</ul><p>{html.escape(receiver_facts(figures))}.</p>"
+        + "</tr>"
+        + "".join(
+            f"<tr><th>{html.escape(name)}</th>" + "".join(f"<td>{number(row[key])}</td>" for _, key in columns) + "</tr>"
+            for name, row in [("receivers", figures), *((words, figures["beside"][way]) for way, words in BESIDE.items())]
+        )
+        + f"</table><ul class=bad>{failures}</ul><p>{html.escape(receiver_facts(figures))}.</p>"
     )
 
 

@@ -15,12 +15,15 @@ from bake_core.spec import Spec
 from bake_core.thresholds import Thresholds
 from service import documents, problems
 from service.parts import Service
-from service.routes import bakes, blobs, health, pages, scenes, verifications
+from service.routes import bakes, blobs, cleanup, health, pages, scenes, verifications
+from service.routes.common import failures
+from service.routes.guard import Guard, needed_scope
 from service.routes.health import Requests
 
 DESCRIPTION = """Server-side global-illumination baking: a glTF scene and a grid of light probes go in, octahedral atlases with a
 measured error come out. Upload (`PUT /v1/blobs`, `POST /v1/scenes`), bake (`POST /v1/bakes`), follow (`/events`), fetch (`/bundle`).
 Errors are RFC 9457 problems with a stable `slug`."""
+TOKENS = "Made by `octobake token create`, for one or several of the scopes submit, read and admin. None is needed on loopback."
 REFERENCE = "#/components/schemas/{model}"
 
 
@@ -29,7 +32,7 @@ def create_app(service: Service) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(service.scheduler.start)
+        await run_in_threadpool(service.start)
         yield
         await run_in_threadpool(service.close)
 
@@ -51,10 +54,11 @@ def describe() -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
     )
-    routers = [module.router for module in (blobs, scenes, bakes, verifications, health, pages)]
+    routers = [module.router for module in (blobs, scenes, bakes, verifications, cleanup, health, pages)]
     for router in routers:
         app.include_router(router)
     problems.install(app, routers)
+    app.add_middleware(Guard)
     app.add_middleware(Requests)
     framework_openapi = app.openapi
 
@@ -78,10 +82,27 @@ def _complete(document: dict[str, Any]) -> None:
     # The framework says 422 of everything that takes a parameter; where a route can answer it, the route says so itself.
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
-    for operations in document["paths"].values():
-        for operation in operations.values():
+    document["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer", "description": TOKENS}}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            scope = needed_scope(method.upper(), path)
+            operation["security"] = [{"token": [scope]}, {}] if scope else []
+            common = (401, 403, 429, 500, 503) if scope else (429, 500, 503)
+            operation["responses"] |= {str(status): answer for status, answer in failures(*common).items()}
+            if method == "post" and path in ("/v1/bakes", "/v1/verifications"):
+                operation["responses"]["202"]["links"] = _links(document, f"{path}/{{id}}")
             if "HTTPValidationError" in str(operation["responses"].get("422")):
                 del operation["responses"]["422"]
+
+
+def _links(document: dict[str, Any], below: str) -> dict[str, Any]:
+    """What can be asked of a job that was just accepted."""
+    return {
+        operation["operationId"]: {"operationId": operation["operationId"], "parameters": {"id": "$response.body#/id"}}
+        for path, operations in document["paths"].items()
+        for operation in operations.values()
+        if path.startswith(below) and "{name}" not in path
+    }
 
 
 def _replace_marks(value: Any) -> None:

@@ -14,20 +14,41 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
 
 import obstore
+from obstore.exceptions import BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
-from bake_core.errors import BakeError, InputError
+from bake_core.errors import BakeError, InputError, OctobakeError
 
 DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 # Large enough that the thread hop per chunk does not matter, small enough that 500 downloads fit in memory.
 CHUNK = 256 * 1024
+
+
+class StoreError(BakeError):
+    """The blob store could not be read or written: it is full, or out of reach. Another try may find it well."""
+
+
+@contextmanager
+def store_errors(where: str) -> Iterator[None]:
+    """Tell what the operating system and the store's library raise as a :class:`StoreError` with slug ``blob.store_failed``."""
+    try:
+        yield
+    except (OSError, BaseError) as e:
+        text = f"the blob store cannot be used ({type(e).__name__}: {e}); see to its room and its network, and requeue the job"
+        raise StoreError("blob.store_failed", text, where) from e
+    except OctobakeError as e:
+        if e.slug not in ("bake.cannot_write", "machine.cannot_write"):
+            raise
+        # The core's words for the same.
+        raise StoreError(e.slug, e.message, e.where) from e
 
 
 def blob_key(digest: str) -> str:
@@ -132,6 +153,20 @@ class Blobs:
         if "sha256:" + hashlib.sha256(data).hexdigest() != digest:
             raise BakeError("blob.corrupt", "does not have the digest it was stored with", work_key(job, name))
         return data
+
+    def peek_work(self, job: str, name: str) -> bytes | None:
+        """What lies in a job's work folder under `name`, for a look at it; None where there is nothing."""
+        try:
+            return bytes(obstore.get(self._store, work_key(job, name)).bytes())
+        except FileNotFoundError:
+            return None
+
+    def remove_blob(self, digest: str) -> None:
+        """Remove a blob that no row names any more."""
+        with suppress(FileNotFoundError):
+            obstore.delete(self._store, blob_key(digest))
+        if self.root is None:
+            (self._local / blob_key(digest)).unlink(missing_ok=True)
 
     def remove_work(self, job: str) -> None:
         """Remove a job's work folder."""

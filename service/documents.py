@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
+from bake_core.spec import MAX_SAMPLES
 from bake_core.verification import HEIGHT, LARGEST_SIDE, MOST_SAMPLES, SAMPLES, WIDTH
+from service.jobs import Attempt as JobAttempt
 from service.jobs import Job, State
 
 Digest = Annotated[
@@ -34,6 +38,19 @@ Time = Annotated[datetime, Field(description="UTC.")]
 
 # Of a picture, in pixels: what `octobake verify` takes, too.
 SMALLEST_SIDE = 16
+
+
+Webhook = Annotated[
+    str,
+    Field(
+        max_length=2048,
+        description="URL that is POSTed to when the job has finished, signed as the Standard Webhooks specification says.",
+        examples=["https://ci.example.com/octobake"],
+    ),
+]
+Keep = Annotated[
+    float, Field(gt=0, le=1e9, description="Keep the files so long after the end; default the service's retention_days.", examples=[604800])
+]
 
 
 class _Request(BaseModel):
@@ -88,6 +105,21 @@ class Scene(BaseModel):
     ignored: list[str] = Field(description="What was read over, one line each.")
 
 
+class MemoryLimit(_Request):
+    """What a job may take at most."""
+
+    memory_bytes: int | None = Field(
+        None, ge=1, le=2**62, description="Resident memory of the process that bakes; beyond it, the job fails with job.over_memory."
+    )
+
+
+class Limits(MemoryLimit):
+    """What a bake may take at most. Time and samples narrow the spec's `stop`, as the bake's own spec then says."""
+
+    seconds: float | None = Field(None, gt=0, le=1e9)
+    samples: int | None = Field(None, ge=1, le=MAX_SAMPLES)
+
+
 class BakeRequest(_Request):
     """A bake to be queued."""
 
@@ -108,6 +140,50 @@ class BakeRequest(_Request):
     spec: SpecDocument
     labels: Labels = {}
     priority: Priority = 0
+    limits: Limits = Limits()
+    webhook: Webhook | None = None
+    keep_seconds: Keep | None = None
+    pinned: bool = Field(False, description="No clean-up takes its files.")
+
+
+class Volume(BaseModel):
+    """A grid of probes, as it was placed in the scene."""
+
+    name: str
+    origin: tuple[float, float, float]
+    spacing: tuple[float, float, float]
+    counts: tuple[int, int, int]
+
+
+class Validation(BaseModel):
+    """What a bake that was only validated would be."""
+
+    valid: Literal[True]
+    scene: Digest
+    spec: SpecDocument = Field(description="With every default filled in, and narrowed by the limits.")
+    volumes: list[Volume]
+    probes: int
+
+
+class LeftOut(BaseModel):
+    """One thing that a bake does without, as the bundle's manifest has it."""
+
+    what: str
+    why: str
+    bytes: int | None = Field(None, description="What that saves before compression; null where it saves time alone.")
+
+
+class Plan(BaseModel):
+    """What a bake will do, known once its scene was prepared."""
+
+    volumes: list[Volume]
+    probes: int
+    outputs: list[str]
+    left_out: list[LeftOut]
+    unneeded_probes: int = Field(description="That no query on a surface asks; left out where the spec's receivers are surfaces.")
+    unneeded_bytes: int = Field(description="Of their texels, before compression.")
+    memory_bytes: int = Field(description="Resident memory at the end, predicted.")
+    atlas_bytes: int = Field(description="Texels before compression.")
 
 
 class Progress(BaseModel):
@@ -119,6 +195,11 @@ class Progress(BaseModel):
     error: float | None = Field(description="So far: relative RMS, 95 % upper bound.")
     seconds: float
     eta: float | None = Field(description="Seconds to go; null while unknown.")
+    eta_range: tuple[float, float] | None = Field(
+        None,
+        description="Seconds to go at the least and at the most: the error falls between 1/N and 1/√N with N samples, each taking "
+        "as long as in the fastest and in the slowest pass so far. Null in lists and events.",
+    )
 
 
 class Point(BaseModel):
@@ -139,15 +220,38 @@ class JobError(BaseModel):
     exit_code: int = Field(description="What `octobake bake` would have exited with.")
 
 
+class Attempt(BaseModel):
+    """One time that somebody worked on a job."""
+
+    number: int
+    began: Time
+    ended: Time | None
+    outcome: Literal["succeeded", "failed", "cancelled", "lost", "restarted"] | None = Field(
+        description="lost: the worker went away; restarted: the service did. Null while it goes on."
+    )
+    reason: str | None
+
+
+class Delivery(BaseModel):
+    """A webhook's message."""
+
+    id: str = Field(description="The same however often it is sent: its header webhook-id.")
+    attempts: int
+    next: Time | None = Field(description="When it is sent again; null where it was delivered or given up.")
+    delivered: Time | None
+    reason: str | None = Field(description="Why the last attempt failed.")
+
+
 class BakeResult(BaseModel):
     """What came of a bake."""
 
     bundle: Digest
     report: Digest
+    preview: Digest | None = None
     samples: int
     error: float | None
     seconds: float
-    stopped: str = Field(description="target, samples or time.")
+    stopped: Literal["target", "samples", "time", "interrupt"] = Field(description="interrupt: it was told to stop.")
     exit_code: int = Field(description="0; or 4: out of budget before the target error.")
 
 
@@ -162,6 +266,12 @@ class _Job(BaseModel):
     finished: Time | None
     progress: Progress | None
     error: JobError | None
+    limits: MemoryLimit
+    pinned: bool
+    keep_seconds: float | None
+    webhook: str | None
+    history: list[Attempt] = Field(description="Every attempt; empty in lists.")
+    deliveries: list[Delivery] = Field(description="What became of the webhook; empty in lists.")
     links: dict[str, str] = Field(description="Paths of what belongs to this job and is there now.")
 
 
@@ -170,6 +280,7 @@ class Bake(_Job):
 
     scene: Digest
     spec: SpecDocument = Field(description="With every default filled in.")
+    plan: Plan | None
     curve: list[Point]
     result: BakeResult | None
 
@@ -191,6 +302,10 @@ class VerificationRequest(_Request):
     )
     labels: Labels = {}
     priority: Priority = 0
+    limits: MemoryLimit = MemoryLimit()
+    webhook: Webhook | None = None
+    keep_seconds: Keep | None = None
+    pinned: bool = Field(False, description="No clean-up takes its files.")
 
 
 class StoredFile(BaseModel):
@@ -216,6 +331,16 @@ class Verification(_Job):
     result: VerificationResult | None
 
 
+class Cleanup(BaseModel):
+    """What a clean-up takes, or would take now."""
+
+    jobs: list[str] = Field(description="Ids of jobs that expire: their files go.")
+    forgotten: list[str] = Field(description="Ids of jobs that expired long ago: their figures and events go, too.")
+    scenes: list[Digest]
+    blobs: int
+    bytes: int
+
+
 Item = TypeVar("Item")
 
 
@@ -231,7 +356,14 @@ class Page(BaseModel, Generic[Item]):
     next: str | None = Field(description="`cursor` of the next page; null on the last.")
 
 
-def common(job: Job, progress: dict[str, Any] | None, path: str, *more: str) -> dict[str, Any]:
+def common(
+    job: Job,
+    progress: dict[str, Any] | None,
+    path: str,
+    history: Sequence[JobAttempt],
+    deliveries: Sequence[Mapping[str, Any]],
+    *more: str,
+) -> dict[str, Any]:
     """What a bake's and a verification's documents share; `more` names resources below the job's own path."""
     path = f"{path}/{job.id}"
     return {
@@ -245,7 +377,13 @@ def common(job: Job, progress: dict[str, Any] | None, path: str, *more: str) -> 
         "finished": _time(job.finished),
         "progress": progress or job.progress,
         "error": job.error,
-        "links": {"self": path, "events": f"{path}/events", **{name: f"{path}/{name}" for name in more}},
+        "limits": {"memory_bytes": job.memory_bytes},
+        "pinned": job.pinned,
+        "keep_seconds": job.ttl,
+        "webhook": job.webhook,
+        "history": [{**asdict(a), "began": _time(a.began), "ended": _time(a.ended)} for a in history],
+        "deliveries": [{**d, "next": _time(d["next"]), "delivered": _time(d["delivered"])} for d in deliveries],
+        "links": {"self": path, "events": f"{path}/events", "log": f"{path}/log", **{name: f"{path}/{name}" for name in more}},
     }
 
 

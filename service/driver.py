@@ -16,6 +16,7 @@ from typing import Any
 
 from distributed import Future, KilledWorker
 from distributed.client import FutureCancelledError
+from sqlalchemy.exc import OperationalError
 
 from bake_core import bake
 from bake_core.clock import Clock
@@ -25,7 +26,7 @@ from bake_core.progress import Progress
 from bake_core.report import Run
 from bake_core.spec import Spec, parse_spec
 from service import worker
-from service.blobs import Blobs
+from service.blobs import Blobs, StoreError
 from service.compute import Compute, Message
 from service.hub import Hub
 from service.jobs import IllegalTransition, Job, Kind, Pass, State
@@ -37,6 +38,8 @@ log = logging.getLogger("octobake.driver")
 # A task that has not ended this long after its cancel is in native code that polls no flag (building, compiling, Vulkan): its worker is
 # killed, so that the CPU is free within the second that is promised, on a busy machine too.
 STOP_SECONDS = 0.3
+# Between tries of a piece that the blob store has failed: nine minutes in all, after which the job fails.
+STORE_PAUSES = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
 # Before the first shard has been timed: paths a second on one thread, on the slow side, so that first shards are rather short.
 FIRST_GUESS_RATE = 200_000.0
 
@@ -45,19 +48,27 @@ class _Cancel(Exception):
     """The job's state has become `cancelling`."""
 
 
+class _Enough(Exception):
+    """The bake shall end with the passes it has."""
+
+
 class _Stop(Exception):
     """The service is going down; the job stays as it is, for the next start to find."""
 
 
 @dataclass
 class _Piece:
-    """One call of a worker function; how far its caller has heard that it is, and how many workers it has cost."""
+    """One call of a worker function.
+
+    `told` is how far its caller has heard that it is, `lost` how many workers it has cost, `refused` how often the blob store failed it.
+    """
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     done: Callable[[Any], None]
     told: float = 0.0
     lost: int = 0
+    refused: int = 0
 
 
 class Driver:
@@ -66,10 +77,13 @@ class Driver:
     def __init__(self, job: Job, settings: Settings, store: Store, blobs: Blobs, compute: Compute, hub: Hub) -> None:
         self.job = job
         self._settings, self._store, self._blobs, self._compute, self._hub = settings, store, blobs, compute, hub
-        # Keys of futures that are done, messages of workers, and the two exceptions above: everything that a driver waits for.
+        # Keys of futures that are done, messages of workers, and the three exceptions above: everything that a driver waits for.
         self._inbox: queue.SimpleQueue[str | Message | type[Exception]] = queue.SimpleQueue()
         self._began = time.monotonic()
         self._seconds_before = 0.0
+        # A restart may have come between the request and its effect.
+        self._enough = job.stop_asked
+        self._tracing = False
         self._shown: dict[str, Any] | None = None
 
     # Called from other threads
@@ -82,6 +96,10 @@ class Driver:
         """The job is `cancelling`."""
         self._inbox.put(_Cancel)
 
+    def finish(self) -> None:
+        """A bake shall end with the passes it has: the store has `stop_asked`. Too late while it is finalizing, and of no effect then."""
+        self._inbox.put(_Enough)
+
     def stop(self) -> None:
         """The service is going down."""
         self._inbox.put(_Stop)
@@ -89,7 +107,13 @@ class Driver:
     # The job
 
     def run(self) -> None:
-        """Drive the job; returns when it has finished, or when the service stops. Never raises."""
+        """Drive the job; returns when it has finished, or when the service stops.
+
+        Raises
+        ------
+        OperationalError
+            The job store cannot be written, so there is no saying what became of the job; its committed work is safe.
+        """
         job = self.job.id
         try:
             if self.job.kind == Kind.BAKE:
@@ -103,6 +127,8 @@ class Driver:
             self._store.move(job, State.CANCELLED)
         except OctobakeError as e:
             self._fail(e)
+        except OperationalError:
+            raise
         except Exception as e:
             log.exception("job %s", job)
             self._fail(BakeError("bake.internal", f"{type(e).__name__}: {e}", f"job {job}"))
@@ -132,7 +158,8 @@ class Driver:
         clock = Clock(spec, self._show)
 
         clock.stage("building")
-        probes, threads = self._one(worker.prepare, work)
+        probes, threads, plan = self._one(worker.prepare, work)
+        self._store.set_plan(self.job.id, plan)
         self._move(State.RUNNING)
         clock.stage("compiling")
         self._one(worker.compile_kernels, work)
@@ -141,12 +168,21 @@ class Driver:
         if merged:
             clock.measured(merged[-1].last, merged[-1].error)
             run.stopped = decide(spec.stop, merged[-1].last, merged[-1].error, self._seconds_before)
+        if merged and run.stopped == "continue" and self._enough:
+            run.stopped = "interrupt"
         while run.stopped == "continue":
             following = opened.pop(0) if opened else self._open_pass(spec, merged, run, probes)
             if following is None:
                 run.stopped = "time"
                 break
-            done = self._trace(work, following, probes, merged[-1] if merged else None, clock)
+            self._tracing = True
+            try:
+                done = self._trace(work, following, probes, merged[-1] if merged else None, clock)
+            except _Enough:
+                run.stopped = "interrupt"
+                break
+            finally:
+                self._tracing = False
             merged.append(done)
             run.shards = done.shards
             run.curve.append(done.point)
@@ -212,7 +248,7 @@ class Driver:
         request = self.job.request
         baked = self._store.job(request["bake"])
         assert baked is not None and baked.result is not None, "a verification is accepted only of a bake that has succeeded"
-        work = self._work(baked)
+        work = replace(self._work(baked), memory_bytes=self.job.memory_bytes)
         self._move(State.RUNNING)
         made = self._one(worker.verify, work, baked.result["bundle"], request)
         self._move(State.FINALIZING)
@@ -227,9 +263,10 @@ class Driver:
     def _work(self, baked: Job) -> worker.Work:
         """What a worker is told of a bake's scene and spec."""
         scene = self._store.scene(baked.request["scene"])
-        assert scene is not None, "a bake is accepted only for a scene that is here, and none is ever removed"
+        assert scene is not None, "a job's scene stays as long as the job's files do"
         files = {key: scene[key] for key in ("root", "files")}
-        return worker.Work(self.job.id, self._blobs.url, files, baked.request["spec"], self._settings.threads, self._settings.cached_scenes)
+        s = self._settings
+        return worker.Work(self.job.id, self._blobs.url, files, baked.request["spec"], s.threads, s.cached_scenes, baked.memory_bytes)
 
     # Pieces of work
 
@@ -244,15 +281,23 @@ class Driver:
         waiting = deque(pieces)
         running: dict[str, tuple[_Piece, Future[Any]]] = {}
         begun: dict[str, str] = {}
+        held_until = 0.0
         while waiting or running:
-            while waiting and len(running) < self._compute.slots:
+            held = max(0.0, held_until - time.monotonic())
+            while waiting and not held and len(running) < self._compute.slots:
                 piece = waiting.popleft()
                 future = self._compute.submit(piece.function, *piece.arguments)
                 running[str(future.key)] = piece, future
                 future.add_done_callback(lambda done: self._inbox.put(str(done.key)))
-            news = self._inbox.get()
+            try:
+                news = self._inbox.get(timeout=held or None)
+            except queue.Empty:
+                continue
+            if news is _Enough and not self._tracing:
+                self._enough = True
+                continue
             if isinstance(news, type):
-                self._halt(running, begun, wait=news is _Cancel)
+                self._halt(running, begun, wait=news is not _Stop)
                 raise news
             if isinstance(news, str):
                 if news not in running:
@@ -262,6 +307,9 @@ class Driver:
                     piece.done(future.result())
                 except (KilledWorker, FutureCancelledError) as e:
                     self._lost(piece, type(e).__name__)
+                    waiting.appendleft(piece)
+                except StoreError as e:
+                    held_until = time.monotonic() + self._refused(piece, e)
                     waiting.appendleft(piece)
                 else:
                     advance(max(0.0, 1.0 - piece.told))
@@ -306,6 +354,15 @@ class Driver:
         if piece.lost >= self._settings.max_attempts:
             text = f"its worker died {piece.lost} times at {piece.function.__name__}; look for what this scene does to memory"
             raise BakeError("bake.crashed", text, f"job {self.job.id}")
+
+    def _refused(self, piece: _Piece, error: StoreError) -> float:
+        """The blob store failed a piece: how many seconds to leave it in peace."""
+        if piece.refused == len(STORE_PAUSES):
+            raise error
+        pause = STORE_PAUSES[piece.refused]
+        piece.refused += 1
+        log.warning("job %s: %s; trying again in %g s", self.job.id, error, pause)
+        return pause
 
     def _seconds(self) -> float:
         """Since the bake began, without the time that it lay in the queue after a restart."""

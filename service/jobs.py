@@ -28,21 +28,26 @@ class State(StrEnum):
     FAILED = "failed"
     CANCELLING = "cancelling"
     CANCELLED = "cancelled"
+    EXPIRED = "expired"
 
 
-# Every change of state that may ever happen. The way back to the queue is a restart's: the service that drove the job is gone.
+# Every change of state that may ever happen. An active job goes back to the queue at a restart, for the service that drove it is gone; a
+# finished one when somebody asks for another try. What has expired has lost its files to a clean-up (service.retention).
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.QUEUED: frozenset({State.PREPARING, State.CANCELLED}),
     State.PREPARING: frozenset({State.RUNNING, State.FAILED, State.CANCELLING, State.QUEUED}),
     State.RUNNING: frozenset({State.FINALIZING, State.FAILED, State.CANCELLING, State.QUEUED}),
     State.FINALIZING: frozenset({State.SUCCEEDED, State.FAILED, State.CANCELLING, State.QUEUED}),
     State.CANCELLING: frozenset({State.CANCELLED}),
-    State.SUCCEEDED: frozenset(),
-    State.FAILED: frozenset(),
-    State.CANCELLED: frozenset(),
+    State.SUCCEEDED: frozenset({State.EXPIRED}),
+    State.FAILED: frozenset({State.EXPIRED, State.QUEUED}),
+    State.CANCELLED: frozenset({State.EXPIRED, State.QUEUED}),
+    State.EXPIRED: frozenset({State.QUEUED}),
 }
-FINISHED = frozenset(s for s, following in TRANSITIONS.items() if not following)
+FINISHED = frozenset({State.SUCCEEDED, State.FAILED, State.CANCELLED, State.EXPIRED})
 ACTIVE = frozenset({State.PREPARING, State.RUNNING, State.FINALIZING})
+# From here another try may be asked for.
+REPEATABLE = frozenset(s for s in FINISHED if State.QUEUED in TRANSITIONS[s])
 
 
 class IllegalTransition(OctobakeError):
@@ -73,6 +78,20 @@ class Job:
         What came of it; `error` has slug, where, message and exit_code.
     created, started, finished : float
         Seconds since 1970; None before they happen.
+    fingerprint : str
+        Of scene, spec and version: what decides a bundle's bytes.
+    memory_bytes : int or None
+        Resident memory that the job's worker may come to.
+    webhook : str or None
+        URL that is told of the job's end.
+    pinned : bool
+        Whether no clean-up may take its files.
+    ttl : float or None
+        Seconds that its files are kept after its end; None: as long as the service's setting says.
+    stop_asked : bool
+        Whether it shall end with the passes that it has.
+    plan : dict or None
+        What it will bake, known since its scene was prepared.
     """
 
     sequence: int
@@ -89,6 +108,28 @@ class Job:
     created: float
     started: float | None
     finished: float | None
+    fingerprint: str
+    memory_bytes: int | None
+    webhook: str | None
+    pinned: bool
+    ttl: float | None
+    stop_asked: bool
+    plan: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One time that somebody worked on a job: from its claim, or from the loss of the worker before, until `outcome`.
+
+    `outcome` is a state (succeeded, failed, cancelled), ``lost`` for a worker that went away, ``restarted`` where the service did; None
+    while it goes on. `reason` says more where there is more to say.
+    """
+
+    number: int
+    began: float
+    ended: float | None
+    outcome: str | None
+    reason: str | None
 
 
 @dataclass(frozen=True)

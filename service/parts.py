@@ -8,10 +8,16 @@ import shutil
 from bake_core.errors import MachineError
 from service.blobs import Blobs
 from service.hub import Hub
+from service.ledger import Ledger
+from service.outbox import Outbox
+from service.retention import Retention
+from service.sandbox import Sandbox
 from service.scenes import Outlines
 from service.scheduler import Scheduler
 from service.settings import Settings
 from service.store import Store
+from service.tokens import Tokens
+from service.webhooks import Webhooks
 
 
 class Service:
@@ -36,16 +42,32 @@ class Service:
         self.blobs = Blobs(settings.store_url, folder / "scratch")
         self.blobs.clean()
         self.store = Store(settings.database_url)
-        self.outlines = Outlines(self.blobs)
+        self.sandbox = Sandbox(settings.temporary_folder, settings.read_seconds, settings.read_memory)
+        self.outlines = Outlines(self.blobs, self.sandbox)
         self.hub = Hub()
+        self.ledger = Ledger(folder)
+        self.tokens = Tokens(self.store.engine)
+        self.outbox = Outbox(self.store.engine)
+        self.retention = Retention(settings, self.store, self.blobs)
+        self.webhooks = Webhooks(settings, self.store.engine)
         self.scheduler = Scheduler(settings, self.store, self.blobs, self.hub)
+
+    def start(self) -> None:
+        """Take up the work, and what goes on beside it."""
+        self.scheduler.start()
+        self.webhooks.start()
+        self.retention.start()
 
     def close(self) -> None:
         """Stop the work, leave it to be resumed, and let go of the data folder."""
         try:
+            self.retention.close()
             self.scheduler.close()
+            self.webhooks.close()
         finally:
+            self.sandbox.close()
             self.store.close()
+            self.ledger.close()
             self._sweep()
             self._lock.close()
 

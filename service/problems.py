@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import sqlite3
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
@@ -11,12 +13,15 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from fastapi.routing import APIRoute, APIRouter
+from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from bake_core.errors import InputError, OctobakeError
 
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("octobake.http")
+# Disks are emptied by people, or by jobs that finish: neither takes less.
+RETRY_SECONDS = "60"
 
 # What the framework raises by itself (routing, chiefly) has no slug of the core's.
 FRAMEWORK_SLUGS = {
@@ -84,10 +89,28 @@ def install(app: FastAPI, routers: Sequence[APIRouter]) -> None:
         # Starlette raises it again after this answer, and the server logs its traceback.
         return problem(500, "service.internal", "an error of the service itself; its log has the traceback")
 
+    async def system(_: Request, error: Exception) -> Response:
+        if _disk_full(error):
+            log.error("the disk is full: %s", error)
+            text = "the service's disk is full; nothing was kept of this request: send it again once there is room"
+            return problem(507, "service.disk_full", text, headers={"Retry-After": RETRY_SECONDS, "Connection": "close"})
+        log.error("unexpected", exc_info=error)
+        return problem(500, "service.internal", "an error of the service itself; its log has the traceback")
+
+    app.add_exception_handler(OSError, system)
+    app.add_exception_handler(OperationalError, system)
     app.add_exception_handler(OctobakeError, ours)
     app.add_exception_handler(HTTPException, framework)
     app.add_exception_handler(RequestValidationError, validation)
     app.add_exception_handler(Exception, unexpected)
+
+
+def _disk_full(error: Exception) -> bool:
+    if isinstance(error, OperationalError):
+        # SQLite's code, and PostgreSQL's class of it (53100, disk_full).
+        code = getattr(error.orig, "sqlite_errorcode", None)
+        return code == sqlite3.SQLITE_FULL or getattr(error.orig, "sqlstate", None) == "53100"
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def _complaint(details: Any) -> tuple[str, str, str]:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bake_core.environment import Find, read_environment
+from bake_core.environment import Find
 from bake_core.errors import BakeError, SpecError
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene_files
 from bake_core.spec import ConstantEnvironment, EquirectEnvironment
 from service.blobs import DIGEST, Blobs
+from service.sandbox import Sandbox
 
 # Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
 KEPT_OUTLINES = 64
@@ -43,7 +43,7 @@ def find_stored(blobs: Blobs) -> Find:
     return find
 
 
-def check_sky(blobs: Blobs, environment: ConstantEnvironment | EquirectEnvironment) -> None:
+def check_sky(sandbox: Sandbox, blobs: Blobs, environment: ConstantEnvironment | EquirectEnvironment) -> None:
     """Read a spec's environment as a worker will.
 
     Raises
@@ -51,15 +51,18 @@ def check_sky(blobs: Blobs, environment: ConstantEnvironment | EquirectEnvironme
     SpecError
         ``spec.image_*``.
     """
-    with _one_sky:
-        read_environment(environment, find_stored(blobs))
+    if isinstance(environment, EquirectEnvironment):
+        image = find_stored(blobs)(environment.image)
+        with _one_sky:
+            sandbox.call("read_sky", environment, image, where="environment.image")
 
 
 class Outlines:
     """The last scenes asked for, without their geometry and images."""
 
-    def __init__(self, blobs: Blobs) -> None:
+    def __init__(self, blobs: Blobs, sandbox: Sandbox) -> None:
         self._blobs = blobs
+        self._sandbox = sandbox
         self._kept: OrderedDict[str, Scene] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -69,15 +72,18 @@ class Outlines:
             if digest in self._kept:
                 self._kept.move_to_end(digest)
                 return self._kept[digest]
-        return self.add(load_stored(self._blobs, scene))
+        return self.read(scene["root"], {name: self._blobs.local_path(blob) for name, blob in scene["files"].items()})[0]
 
-    def add(self, scene: Scene) -> Scene:
-        """Keep and answer the outline of a scene that is at hand."""
-        # Copies, for a slice would keep the whole array alive.
-        arrays = ("positions", "normals", "colors", "uvs", "indices", "triangle_material")
-        outline = replace(scene, **{name: getattr(scene, name)[:0].copy() for name in arrays}, images=())
+    def read(self, root: str, files: Mapping[str, Path]) -> tuple[Scene, dict[str, Any]]:
+        """Read a scene from files, in a child process; keeps its outline, and answers that and what is in the scene.
+
+        Raises
+        ------
+        SceneError
+        """
+        outline, contents = self._sandbox.call("read_outline", root, dict(files), where=root)
         with self._lock:
-            self._kept[scene.digest] = outline
+            self._kept[outline.digest] = outline
             while len(self._kept) > KEPT_OUTLINES:
                 self._kept.popitem(last=False)
-        return outline
+        return outline, contents

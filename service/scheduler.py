@@ -31,6 +31,8 @@ class Scheduler:
         self._compute: Compute | None = None
         self._drivers: dict[str, Driver] = {}
         self._threads: set[threading.Thread] = set()
+        # Jobs whose driver could not even say how it ended, because the store failed it.
+        self._orphans: set[str] = set()
         self._bell = threading.Condition()
         self._rung = False
         self._stopping = False
@@ -62,6 +64,18 @@ class Scheduler:
             driver = self._drivers.get(job)
         if driver:
             driver.cancel()
+
+    def finish(self, job: str) -> None:
+        """A running bake shall end with the passes it has."""
+        with self._bell:
+            driver = self._drivers.get(job)
+        if driver:
+            driver.finish()
+
+    def drives(self, job: str) -> bool:
+        """Whether a driver is still at work on a job, if only to tidy up."""
+        with self._bell:
+            return job in self._drivers
 
     def close(self) -> None:
         """Stop the drivers, leave their jobs to the next start, and stop the workers."""
@@ -97,13 +111,17 @@ class Scheduler:
 
     def _fill(self) -> None:
         assert self._compute
+        for orphan in list(self._orphans):
+            self._store.take_up(orphan)
+            self._orphans.discard(orphan)
+            self._hub.tell(orphan)
         while not self._stopping and len(self._drivers) < self._compute.slots and (job := self._store.claim()):
             driver = Driver(job, self._settings, self._store, self._blobs, self._compute, self._hub)
             thread = threading.Thread(target=self._drive, args=(driver,), name=f"octobake-job-{job.id}", daemon=True)
             with self._bell:
                 self._drivers[job.id] = driver
                 self._threads.add(thread)
-            # A cancel may have come between the claim and the line above.
+            # A cancel may have come between the claim and the line above. (A stop cannot: it is taken of a running bake only.)
             if (now := self._store.job(job.id)) and now.state == "cancelling":
                 driver.cancel()
             self._hub.tell(job.id)
@@ -113,8 +131,9 @@ class Scheduler:
         try:
             driver.run()
         except Exception:
-            # The store itself failed (a full disk, a lost database): the job stays where it is until a restart reconciles it.
-            log.exception("job %s is left as it stands", driver.job.id)
+            # The store itself failed (a full disk, a lost database): the job goes back to the queue as soon as the store takes it.
+            log.exception("job %s has lost its driver; it is queued again when the store can be written", driver.job.id)
+            self._orphans.add(driver.job.id)
         with self._bell:
             del self._drivers[driver.job.id]
             self._threads.discard(threading.current_thread())

@@ -8,118 +8,28 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from bake_core.errors import MachineError
-from service.jobs import FINISHED, TRANSITIONS, Event, IllegalTransition, Job, Kind, Pass, Shard, State
+from service import outbox
+from service.jobs import FINISHED, REPEATABLE, TRANSITIONS, Attempt, Event, IllegalTransition, Job, Kind, Pass, Shard, State
+from service.tables import attempts, blobs, events, idempotency_keys, jobs, metadata, open_engine, passes, reading, scenes, shards, writing
 
-# SQLite's writers wait for each other this long; the longest transaction here takes milliseconds.
-BUSY_SECONDS = 10.0
-
-metadata = sa.MetaData()
-blobs = sa.Table(
-    "blobs",
-    metadata,
-    sa.Column("digest", sa.String(71), primary_key=True),
-    sa.Column("size", sa.BigInteger, nullable=False),
-    sa.Column("created", sa.Double, nullable=False),
-)
-scenes = sa.Table(
-    "scenes",
-    metadata,
-    sa.Column("digest", sa.String(71), primary_key=True),
-    # {"root": NAME, "files": {NAME: "sha256:HEX"}}; a single GLB has one file, itself.
-    sa.Column("root", sa.Text, nullable=False),
-    sa.Column("files", sa.JSON, nullable=False),
-    sa.Column("contents", sa.JSON, nullable=False),
-    sa.Column("created", sa.Double, nullable=False),
-)
-jobs = sa.Table(
-    "jobs",
-    metadata,
-    # BIGINT would not autoincrement on SQLite.
-    sa.Column("sequence", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True, autoincrement=True),
-    sa.Column("id", sa.String(32), nullable=False, unique=True),
-    sa.Column("kind", sa.String(16), nullable=False),
-    sa.Column("state", sa.String(16), nullable=False),
-    sa.Column("request", sa.JSON, nullable=False),
-    sa.Column("labels", sa.JSON, nullable=False),
-    sa.Column("priority", sa.Integer, nullable=False),
-    sa.Column("attempts", sa.Integer, nullable=False, default=0),
-    sa.Column("progress", sa.JSON(none_as_null=True)),
-    sa.Column("result", sa.JSON(none_as_null=True)),
-    sa.Column("error", sa.JSON(none_as_null=True)),
-    sa.Column("created", sa.Double, nullable=False),
-    sa.Column("started", sa.Double),
-    sa.Column("finished", sa.Double),
-    sa.Index("jobs_queue", "state", "priority", "sequence"),
-    sqlite_autoincrement=True,  # a sequence is never used twice, so a cursor never goes back
-)
-events = sa.Table(
-    "events",
-    metadata,
-    sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True, autoincrement=True),
-    sa.Column("job", sa.String(32), sa.ForeignKey("jobs.id"), nullable=False),
-    sa.Column("at", sa.Double, nullable=False),
-    sa.Column("type", sa.String(16), nullable=False),
-    sa.Column("data", sa.JSON, nullable=False),
-    sa.Index("events_of_job", "job", "id"),
-    sqlite_autoincrement=True,
-)
-passes = sa.Table(
-    "passes",
-    metadata,
-    sa.Column("job", sa.String(32), sa.ForeignKey("jobs.id"), primary_key=True),
-    sa.Column("index", sa.Integer, primary_key=True),
-    sa.Column("first", sa.Integer, nullable=False),
-    sa.Column("last", sa.Integer, nullable=False),
-    sa.Column("shards", sa.Integer, nullable=False),
-    sa.Column("state", sa.Text),
-    sa.Column("allocation", sa.Text),
-    sa.Column("error", sa.Double),
-    sa.Column("seconds", sa.Double),
-    # Of all passes up to this one.
-    sa.Column("rays", sa.BigInteger),
-)
-shards = sa.Table(
-    "shards",
-    metadata,
-    sa.Column("job", sa.String(32), sa.ForeignKey("jobs.id"), primary_key=True),
-    sa.Column("pass_index", sa.Integer, primary_key=True),
-    sa.Column("index", sa.Integer, primary_key=True),
-    sa.Column("tally", sa.Text, nullable=False),
-    sa.Column("seconds", sa.Double, nullable=False),
-)
+# Being asked for changes a blob's row no oftener than this; the shortest time that anything is kept is longer.
+USED_SECONDS = 60.0
+# A key stands for its request this long; a client that still tries has been told something else by then.
+KEY_SECONDS = 86400.0
 
 
 class Store:
     """The tables above, one method per question."""
 
     def __init__(self, url: str) -> None:
-        self.engine = sa.create_engine(url)
-        if self.engine.dialect.name == "sqlite":
-            sa.event.listen(self.engine, "connect", _open_sqlite)
-            sa.event.listen(self.engine, "begin", _begin_sqlite)
-        metadata.create_all(self.engine)
-        self._check_columns()
-
-    def _check_columns(self) -> None:
-        """Refuse the tables of another version, rather than fail at the first job."""
-        there = sa.inspect(self.engine)
-        for table in metadata.sorted_tables:
-            missing = {c.name for c in table.columns} - {c["name"] for c in there.get_columns(table.name)}
-            if missing:
-                raise MachineError(
-                    "service.other_version",
-                    f"the table {table.name!r} lacks {', '.join(sorted(missing))}: another version of octobake made it; "
-                    "give --data (or --database) a new place",
-                    self.engine.url.render_as_string(hide_password=True),
-                )
+        self.engine = open_engine(url)
 
     def close(self) -> None:
         """Close every connection; SQLite folds its log back into the file."""
@@ -130,19 +40,32 @@ class Store:
     def add_blob(self, digest: str, size: int) -> None:
         """Record a blob that is safely in the blob store; again is the same."""
         with self._write() as c:
-            if c.execute(sa.select(blobs.c.size).where(blobs.c.digest == digest)).first() is None:
-                c.execute(sa.insert(blobs).values(digest=digest, size=size, created=time.time()))
+            now = time.time()
+            if not c.execute(sa.update(blobs).where(blobs.c.digest == digest).values(used=now)).rowcount:
+                c.execute(sa.insert(blobs).values(digest=digest, size=size, created=now, used=now))
 
     def blob_size(self, digest: str) -> int | None:
         """Bytes of a blob, or None where there is none."""
         with self._read() as c:
             return c.execute(sa.select(blobs.c.size).where(blobs.c.digest == digest)).scalar_one_or_none()
 
+    def use_blob(self, digest: str) -> int | None:
+        """As :meth:`blob_size`, and no clean-up takes a blob that was just asked for."""
+        with self._read() as c:
+            row = c.execute(sa.select(blobs.c.size, blobs.c.used).where(blobs.c.digest == digest)).first()
+        if row is None or time.time() - row.used < USED_SECONDS:
+            return None if row is None else int(row.size)
+        with self._write() as c:
+            # A clean-up may have come between.
+            changed = c.execute(sa.update(blobs).where(blobs.c.digest == digest).values(used=time.time()))
+        return int(row.size) if changed.rowcount else None
+
     def add_scene(self, digest: str, root: str, files: Mapping[str, str], contents: Mapping[str, Any]) -> None:
         """Record a scene that the reader accepted; again is the same."""
         with self._write() as c:
-            if c.execute(sa.select(scenes.c.root).where(scenes.c.digest == digest)).first() is None:
-                row = {"digest": digest, "root": root, "files": dict(files), "contents": dict(contents), "created": time.time()}
+            now = time.time()
+            if not c.execute(sa.update(scenes).where(scenes.c.digest == digest).values(used=now)).rowcount:
+                row = {"digest": digest, "root": root, "files": dict(files), "contents": dict(contents), "created": now, "used": now}
                 c.execute(sa.insert(scenes).values(row))
 
     def scene(self, digest: str) -> dict[str, Any] | None:
@@ -153,14 +76,85 @@ class Store:
 
     # Jobs
 
-    def add_job(self, kind: Kind, request: Mapping[str, Any], labels: Mapping[str, str], priority: int) -> Job:
-        """Accept a job: once this returns, it survives whatever happens to the process."""
+    def add_job(
+        self,
+        kind: Kind,
+        request: Mapping[str, Any],
+        labels: Mapping[str, str],
+        priority: int,
+        *,
+        fingerprint: str = "",
+        memory_bytes: int | None = None,
+        webhook: str | None = None,
+        pinned: bool = False,
+        ttl: float | None = None,
+        uses: Collection[str] = (),
+        key: tuple[str, str] | None = None,
+    ) -> Job:
+        """Accept a job: once this returns, it survives whatever happens to the process.
+
+        `uses` are the digests of the scene and of all files that the job needs, `key` what :meth:`take_key` was given.
+        """
         job = secrets.token_hex(8)
+        now = time.time()
         with self._write() as c:
-            row = {"id": job, "kind": kind, "state": State.QUEUED, "request": dict(request), "labels": dict(labels), "priority": priority}
-            c.execute(sa.insert(jobs).values(attempts=0, created=time.time(), **row))
+            c.execute(
+                sa.insert(jobs).values(
+                    id=job,
+                    kind=kind,
+                    state=State.QUEUED,
+                    request=dict(request),
+                    labels=dict(labels),
+                    priority=priority,
+                    attempts=0,
+                    created=now,
+                    fingerprint=fingerprint,
+                    memory_bytes=memory_bytes,
+                    webhook=webhook,
+                    pinned=pinned,
+                    ttl=ttl,
+                    stop_asked=False,
+                )
+            )
+            _use(c, uses, now)
+            if key is not None:
+                owner, name = key
+                mine = (idempotency_keys.c.owner == owner) & (idempotency_keys.c.key == name)
+                c.execute(sa.update(idempotency_keys).where(mine).values(job=job))
             _add_event(c, job, "state", {"state": State.QUEUED})
             return _job(c, job)
+
+    def take_key(self, owner: str, key: str, request: str) -> tuple[str, str | None]:
+        """Whose turn it is with an Idempotency-Key; `request` is a digest of what it came with.
+
+        Answers (the request that has the key, its job). The job is None while that request is being answered; the request is empty where
+        the key is the caller's now, who must fulfil it with :meth:`add_job` or give it back.
+        """
+        mine = (idempotency_keys.c.owner == owner) & (idempotency_keys.c.key == key)
+        now = time.time()
+        with self._write() as c:
+            c.execute(sa.delete(idempotency_keys).where(idempotency_keys.c.created < now - KEY_SECONDS))
+            found = c.execute(sa.select(idempotency_keys).where(mine)).first()
+            if found is not None:
+                return found.request, found.job
+            c.execute(sa.insert(idempotency_keys).values(owner=owner, key=key, request=request, created=now))
+            return "", None
+
+    def give_key(self, owner: str, key: str, job: str | None = None) -> None:
+        """Give back a key whose request came to nothing, or that was answered with a `job` that there was."""
+        mine = (idempotency_keys.c.owner == owner) & (idempotency_keys.c.key == key)
+        with self._write() as c:
+            if job is not None:
+                c.execute(sa.update(idempotency_keys).where(mine).values(job=job))
+            else:
+                c.execute(sa.delete(idempotency_keys).where(mine & idempotency_keys.c.job.is_(None)))
+
+    def finished_like(self, fingerprint: str) -> Job | None:
+        """The newest bake of this fingerprint that has succeeded of its own accord."""
+        query = sa.select(jobs).where((jobs.c.fingerprint == fingerprint) & (jobs.c.state == State.SUCCEEDED))
+        with self._read() as c:
+            found = [_to_job(row) for row in c.execute(query.order_by(jobs.c.sequence.desc()))]
+        return next((job for job in found if job.result and job.result["stopped"] != "interrupt"), None)
 
     def job(self, job: str, kind: Kind | None = None) -> Job | None:
         """One job, or None; with `kind`, only if it is of that kind."""
@@ -224,18 +218,100 @@ class Store:
                 return now
             return _move(c, job, State.CANCELLED if now.state == State.QUEUED else State.CANCELLING)
 
+    def requeue(self, job: str, uses: Collection[str]) -> Job:
+        """Queue a finished job again, from its beginning: the sums of its passes went when it finished.
+
+        Raises
+        ------
+        IllegalTransition
+            Where TRANSITIONS has no such change.
+        """
+        with self._write() as c:
+            now = _job(c, job, lock=True)
+            if now.state not in REPEATABLE:
+                raise IllegalTransition(job, now.state, State.QUEUED)
+            for table in (shards, passes):
+                c.execute(sa.delete(table).where(table.c.job == job))
+            _use(c, uses, time.time())
+            anew = {name: sa.null() for name in ("progress", "result", "error", "started", "finished")}
+            return _move(c, job, State.QUEUED, stop_asked=False, **anew)
+
+    def ask_stop(self, job: str) -> Job | None:
+        """Ask a running bake to end with the passes it has; None where it has none, or does not run."""
+        with self._write() as c:
+            now = _job(c, job, lock=True)
+            whole = c.execute(sa.select(passes.c.index).where((passes.c.job == job) & passes.c.state.is_not(None)).limit(1)).first()
+            if now.state != State.RUNNING or whole is None:
+                return None
+            if not now.stop_asked:
+                c.execute(sa.update(jobs).where(jobs.c.id == job).values(stop_asked=True))
+                _add_event(c, job, "stop", {})
+            return _job(c, job)
+
+    def pin(self, job: str, pinned: bool) -> Job:
+        """Keep a job's files from every clean-up, or no longer."""
+        with self._write() as c:
+            c.execute(sa.update(jobs).where(jobs.c.id == job).values(pinned=pinned))
+            return _job(c, job)
+
+    def expire(self, job: str) -> bool:
+        """A finished job's files are to go; False where somebody wants them after all."""
+        with self._write() as c:
+            now = _job(c, job, lock=True)
+            if now.pinned or State.EXPIRED not in TRANSITIONS[now.state]:
+                return False
+            _move(c, job, State.EXPIRED)
+            return True
+
+    def forget(self, job: str) -> bool:
+        """Remove every row of a job that has expired; False where somebody has queued it again."""
+        with self._write() as c:
+            if _job(c, job, lock=True).state != State.EXPIRED:
+                return False
+            for table in reversed(metadata.sorted_tables):
+                if "job" in table.c:
+                    c.execute(sa.delete(table).where(table.c.job == job))
+            c.execute(sa.delete(jobs).where(jobs.c.id == job))
+            return True
+
+    def set_plan(self, job: str, plan: Mapping[str, Any]) -> None:
+        """Record what a job will bake."""
+        with self._write() as c:
+            c.execute(sa.update(jobs).where(jobs.c.id == job).values(plan=dict(plan)))
+            _add_event(c, job, "plan", {"probes": plan["probes"]})
+
+    def attempts(self, job: str) -> list[Attempt]:
+        """All that was tried, in order."""
+        query = sa.select(attempts).where(attempts.c.job == job).order_by(attempts.c.number)
+        with self._read() as c:
+            return [Attempt(row.number, row.began, row.ended, row.outcome, row.reason) for row in c.execute(query)]
+
     def add_attempt(self, job: str, why: str) -> None:
-        """Count a worker lost under this job."""
+        """Count a worker lost under this job; with another one it goes on."""
         with self._write() as c:
             c.execute(sa.update(jobs).where(jobs.c.id == job).values(attempts=jobs.c.attempts + 1))
+            now = time.time()
+            _end_attempt(c, job, now, "lost", why)
+            _begin_attempt(c, job, now)
             _add_event(c, job, "retry", {"reason": why})
 
     def reconcile(self) -> None:
-        """After a start: nobody drives the jobs that were under way, so queue them again, and end those that were being cancelled."""
+        """After a start: nobody drives the jobs that were under way, so queue them again, and end those that were being cancelled.
+
+        Whoever held a key for a request that was never answered tries it again.
+        """
         with self._write() as c:
+            c.execute(sa.delete(idempotency_keys).where(idempotency_keys.c.job.is_(None)))
             under_way = sa.select(jobs.c.id, jobs.c.state).where(jobs.c.state.not_in([State.QUEUED, *FINISHED])).order_by(jobs.c.sequence)
             for row in c.execute(under_way).all():
-                _move(c, row.id, State.CANCELLED if row.state == State.CANCELLING else State.QUEUED)
+                _move(c, row.id, _left_behind(row.state))
+
+    def take_up(self, job: str) -> None:
+        """As :meth:`reconcile`, for a job whose driver has ended before its time."""
+        with self._write() as c:
+            state = _job(c, job, lock=True).state
+            if state not in (State.QUEUED, *FINISHED):
+                _move(c, job, _left_behind(state))
 
     # Passes and shards
 
@@ -283,15 +359,11 @@ class Store:
         with self._read() as c:
             return [Event(row.id, row.job, row.at, row.type, row.data) for row in c.execute(query)]
 
-    @contextmanager
-    def _write(self) -> Iterator[Connection]:
-        with self.engine.begin() as connection:
-            yield connection
+    def _write(self) -> AbstractContextManager[Connection]:
+        return writing(self.engine)
 
-    @contextmanager
-    def _read(self) -> Iterator[Connection]:
-        with self.engine.connect().execution_options(octobake_read=True) as connection:
-            yield connection
+    def _read(self) -> AbstractContextManager[Connection]:
+        return reading(self.engine)
 
 
 def _job(c: Connection, job: str, lock: bool = False) -> Job:
@@ -306,12 +378,42 @@ def _move(c: Connection, job: str, state: State, **columns: Any) -> Job:
     now = time.time()
     if state == State.PREPARING and before.started is None:
         columns["started"] = now
-    if state in FINISHED:
+    ended = state in FINISHED and before.state not in FINISHED
+    if ended:
         columns["finished"] = now
     c.execute(sa.update(jobs).where(jobs.c.id == job).values(state=state, **columns))
-    told = {k: columns[k] for k in ("result", "error") if columns.get(k) is not None}
+    told = {k: columns[k] for k in ("result", "error") if state in FINISHED and columns.get(k) is not None}
     _add_event(c, job, "state", {"state": state, **told})
-    return _job(c, job)
+    if state == State.PREPARING:
+        _begin_attempt(c, job, now)
+    elif ended:
+        _end_attempt(c, job, now, state, (columns.get("error") or {}).get("slug"))
+    elif state == State.QUEUED:
+        _end_attempt(c, job, now, "restarted", None)
+    after = _job(c, job)
+    if ended and after.webhook is not None:
+        outbox.add(c, after, now)
+    return after
+
+
+def _left_behind(state: str) -> State:
+    """What becomes of a job under way that nobody drives."""
+    return State.CANCELLED if state == State.CANCELLING else State.QUEUED
+
+
+def _begin_attempt(c: Connection, job: str, now: float) -> None:
+    before = c.execute(sa.select(sa.func.count()).where(attempts.c.job == job)).scalar_one()
+    c.execute(sa.insert(attempts).values(job=job, number=before + 1, began=now))
+
+
+def _end_attempt(c: Connection, job: str, now: float, outcome: str, reason: str | None) -> None:
+    going_on = (attempts.c.job == job) & attempts.c.ended.is_(None)
+    c.execute(sa.update(attempts).where(going_on).values(ended=now, outcome=outcome, reason=reason))
+
+
+def _use(c: Connection, digests: Iterable[str], now: float) -> None:
+    for table in (blobs, scenes):
+        c.execute(sa.update(table).where(table.c.digest.in_(list(digests))).values(used=now))
 
 
 def _add_event(c: Connection, job: str, kind: str, data: Mapping[str, Any]) -> None:
@@ -321,22 +423,3 @@ def _add_event(c: Connection, job: str, kind: str, data: Mapping[str, Any]) -> N
 def _to_job(row: Row[Any]) -> Job:
     columns = dict(row._mapping)
     return Job(**{**columns, "kind": Kind(columns["kind"]), "state": State(columns["state"])})
-
-
-def _open_sqlite(connection: Any, _: object) -> None:
-    # The driver must not begin transactions of its own: _begin_sqlite says which kind each is.
-    connection.isolation_level = None
-    pragmas: Sequence[str] = (
-        "journal_mode = WAL",  # readers never wait for the writer
-        "synchronous = FULL",  # a commit is on the disk when it returns: what 202 promises
-        "foreign_keys = ON",
-        f"busy_timeout = {int(BUSY_SECONDS * 1000)}",
-    )
-    for pragma in pragmas:
-        connection.execute(f"PRAGMA {pragma}").close()
-
-
-def _begin_sqlite(connection: Connection) -> None:
-    # A writer takes its lock at the start: two that read first and then write would fail each other without waiting.
-    reads = connection.get_execution_options().get("octobake_read", False)
-    connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")

@@ -23,21 +23,28 @@ from dask.typing import Key
 from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
-from bake_core import bake, verification
+from bake_core import bake, plan, verification
 from bake_core.allocation import Allocation
 from bake_core.bundle import read_bundle
 from bake_core.cameras import parse_cameras
+from bake_core.errors import BakeError
+from bake_core.images import write_png
+from bake_core.preview import preview
 from bake_core.progress import Progress
 from bake_core.report import Run
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
-from service.blobs import Blobs
+from service.blobs import Blobs, store_errors
 from service.scenes import find_stored, load_stored
 
 TOPIC = "octobake"
 # Oftener than this nobody can read; the terminal redraws at 10 Hz, a web page at less.
 REPORT_INTERVAL = 0.2
+# Between two looks at the memory of a job that has a limit. Kernels poll their flag for every texel, so this is how late a job is stopped.
+WATCH_SECONDS = 0.05
+# In a job's work folder: the picture of its last whole pass.
+PREVIEW = "preview"
 Flag = NDArray[np.uint8]
 
 
@@ -56,6 +63,8 @@ class Work:
         Canonical.
     threads : int
     cached_scenes : int
+    memory_bytes : int or None
+        Resident memory that the process may come to while it works on this.
     """
 
     job: str
@@ -64,6 +73,7 @@ class Work:
     spec: Mapping[str, Any]
     threads: int
     cached_scenes: int
+    memory_bytes: int | None = None
 
     @property
     def own_threads(self) -> int:
@@ -71,15 +81,27 @@ class Work:
         return self.threads or len(os.sched_getaffinity(0))
 
 
-def prepare(work: Work) -> tuple[int, int]:
-    """Read, check and build the scene; answers how many probes there are, and how many threads this worker bakes with."""
-    with _task():
-        return _prepared(work).probe_count, work.own_threads
+def prepare(work: Work) -> tuple[int, int, dict[str, Any]]:
+    """Read, check and build the scene; answers how many probes there are, how many threads this worker bakes with, and the plan.
+
+    Raises
+    ------
+    BakeError
+        ``job.over_memory``, where the bake would come to more than it may.
+    """
+    with _task(work):
+        prepared = _prepared(work)
+        # Its time is told while it runs, by what has been traced.
+        held = plan.contents(prepared)
+        told = asdict(held) | {"left_out": [x.entry() for x in held.left_out]}
+        if work.memory_bytes is not None and told["memory_bytes"] > work.memory_bytes:
+            raise _over_memory(work, f"{told['memory_bytes']} bytes are predicted")
+        return prepared.probe_count, work.own_threads, told
 
 
 def compile_kernels(work: Work) -> None:
     """Compile what the scene needs, or fetch it from the cache: its time is no sample's. Then see that the scene has a finite answer."""
-    with _task() as task:
+    with _task(work) as task:
         prepared = _prepared(work)
         bake.compile_kernels(prepared, audited=True)
         bake.check_finite(prepared, threads=work.own_threads, cancelled=task.flag)
@@ -87,7 +109,7 @@ def compile_kernels(work: Work) -> None:
 
 def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int], allocation: str | None) -> tuple[str, float]:
     """One shard of one pass; answers where its sums are stored and the seconds it took."""
-    with _task() as task:
+    with _task(work) as task:
         prepared = _prepared(work)
         blobs = _blobs(work.store)
         given = Allocation.from_bytes(blobs.get_work(work.job, allocation)) if allocation else Allocation.start(prepared.probe_count)
@@ -105,11 +127,12 @@ def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> d
     dict
         Where the new sums are stored, and what the next pass is to know of them; their error, and how many rays there were in all.
     """
-    with _task():
+    with _task(work), tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         sums = _state(work, state)
         sums.add([Tally.from_bytes(blobs.get_work(work.job, tally)) for tally in tallies])
         sums.allocate(parse_spec(work.spec).stop)
+        blobs.put_work(work.job, PREVIEW, _preview(sums, folder).read_bytes())
         return {
             "state": blobs.put_work(work.job, f"state-{name}", sums.to_bytes()),
             "allocation": blobs.put_work(work.job, f"allocation-{name}", sums.allocation.to_bytes()),
@@ -119,19 +142,20 @@ def merge(work: Work, name: str, state: str | None, tallies: Sequence[str]) -> d
 
 
 def finish(work: Work, state: str, run: Run) -> dict[str, Any]:
-    """Filter, encode and pack; answers the digests and sizes of the bundle and of its report."""
-    with _task() as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+    """Filter, encode and pack; answers the digests and sizes of the bundle, of its report and of a preview."""
+    with _task(work) as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         out = Path(folder) / "bundle.zip"
-        bake.finish(_prepared(work), _state(work, state), run, out, cancelled=task.flag)
+        sums = _state(work, state)
+        bake.finish(_prepared(work), sums, run, out, cancelled=task.flag)
         with zipfile.ZipFile(out) as bundle:
             report = Path(bundle.extract("report.json", folder))
-        return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report)}
+        return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report), "preview": blobs.put_blob(_preview(sums, folder))}
 
 
 def verify(work: Work, bundle: str, request: Mapping[str, Any]) -> dict[str, Any]:
     """Render with a bundle and path-traced, and compare; answers the report, and the digests and sizes of all files."""
-    with _task() as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
+    with _task(work) as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         out = Path(folder) / "verification"
         report = verification.verify(
@@ -210,13 +234,67 @@ class _Task:
 
 
 @contextmanager
-def _task() -> Iterator[_Task]:
+def _task(work: Work) -> Iterator[_Task]:
     task = _Task()
     task.tell(began=True)
+    watch = _Watch(task, work)
     try:
-        yield task
+        with watch, store_errors(f"job {work.job}"):
+            yield task
     finally:
         task.tell(ended=True)
+
+
+class _Watch:
+    """Stops a task whose process comes to more memory than its job may take; does nothing where it may take any."""
+
+    def __init__(self, task: _Task, work: Work) -> None:
+        self._task, self._work = task, work
+        self._over = 0
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> None:
+        if self._work.memory_bytes is not None:
+            self._thread = threading.Thread(target=self._look, daemon=True)
+            self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join()
+        if self._over:
+            # The next job must not be blamed for what this one keeps.
+            with _lock:
+                _cache.clear()
+            # Whatever the flag made of the task: this is why it was raised.
+            raise _over_memory(self._work, f"the worker came to {self._over}") from None
+
+    def _look(self) -> None:
+        assert self._work.memory_bytes is not None
+        while not self._done.wait(WATCH_SECONDS):
+            resident = _resident_bytes()
+            if resident > self._work.memory_bytes:
+                self._over = resident
+                # Kernels poll it; what polls nothing (a build) ends first.
+                self._task.flag[0] = 1
+                return
+
+
+def _over_memory(work: Work, what: str) -> BakeError:
+    text = f"{what}, more than its limit of {work.memory_bytes}; raise limits.memory_bytes, or bake fewer probes at a time"
+    return BakeError("job.over_memory", text, f"job {work.job}")
+
+
+def _resident_bytes() -> int:
+    # Second figure of statm: resident pages.
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _preview(sums: State, folder: str) -> Path:
+    path = Path(folder) / "preview.png"
+    write_png(path, preview(sums))
+    return path
 
 
 # A worker has one task slot, so one thread at a time works on these; the lock is for whoever runs a worker with more.
@@ -239,7 +317,8 @@ def _prepared(work: Work) -> bake.Prepared:
         if key not in _cache:
             scene = load_stored(stored, work.scene)
             # Room first: the old scene's memory is free before the new one's is taken.
-            while len(_cache) >= work.cached_scenes:
+            # A job with a limit is not charged for the scenes of others.
+            while len(_cache) >= (work.cached_scenes if work.memory_bytes is None else 1):
                 _cache.popitem(last=False)
             _cache[key] = bake.prepare(scene, parse_spec(work.spec), find_stored(stored))
         _cache.move_to_end(key)

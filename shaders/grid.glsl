@@ -8,10 +8,12 @@ struct ObVolume {
     ivec3 counts;           // probes along x, y, z
     ivec2 tiles;            // columns and rows of tiles in one layer of every atlas, and of texels in one of the probe table
     int irradianceTexels;   // interior texels along the side of a tile, without its border
-    int visibilityTexels;   // likewise; 0: the bundle has no visibility, every probe counts as visible
-    float distanceLimit;    // to which visibility distances were clamped
+    int wallTexels;         // likewise, of the walls; 0: the bundle has none, every probe counts as visible
+    float wallUnit;         // the length in which the walls' distances are given
+    float distanceLimit;    // to which they were clamped
     float normalBias;       // how far a point is moved along its normal before visibility is asked for
     float viewBias;         // how far along the direction to the viewer
+    float visibilitySoftness; // over what part of the distance a wall's shadow fades
     float visibilityFloor;  // least weight of a probe that is not visible, so that a point that no probe sees is not black
 };
 
@@ -41,13 +43,12 @@ ObCell obCell(ObVolume volume, vec3 position) {
     return ObCell(ivec3(base), g - base);
 }
 
-// Squared distance from a point to a volume's box, 0 inside. An axis with one probe reaches half a spacing to both sides.
-float obDistanceSquared(ObVolume volume, vec3 position) {
+// How far outside of a volume's box a point is along each axis, 0 inside. An axis with one probe reaches half a spacing to both sides.
+vec3 obBeyond(ObVolume volume, vec3 position) {
     vec3 last = vec3(volume.counts - 1);
     vec3 margin = vec3(equal(volume.counts, ivec3(1))) * 0.5 * volume.spacing;
     vec3 p = position - volume.origin;
-    vec3 d = max(max(-margin - p, p - last * volume.spacing - margin), vec3(0.0));
-    return dot(d, d);
+    return max(max(-margin - p, p - last * volume.spacing - margin), vec3(0.0));
 }
 
 // Flat index of probe (i, j, k): i + nx * (j + ny * k).

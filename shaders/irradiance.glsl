@@ -3,7 +3,7 @@
 // Majercik et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production", JCGT 10(2), for the surface bias.
 // Mirrors bake_core/irradiance.py. Needs octahedral.glsl, grid.glsl, constants.glsl, and three macros of the host (see README.md):
 //   OB_IRRADIANCE(v, uvw)   vec3, bilinear, from volume v's irradiance atlas
-//   OB_VISIBILITY(v, uvw)   vec2, bilinear, from volume v's visibility atlas
+//   OB_WALLS(v, uvw)        float, bilinear, from volume v's walls atlas
 //   OB_PROBE(v, texel)      vec4, one texel, from volume v's probe table
 
 // How much a probe counts by where it stands: most in front of the surface, little behind it, never nothing (a cell may have no other).
@@ -14,23 +14,23 @@ float obFacing(vec3 toProbe, vec3 normal) {
     return wrap * wrap + 0.2;
 }
 
-// How much of a probe's filtered surroundings lets it see a point: Chebyshev's bound on the share of distances beyond the point's,
-// Donnelly and Lauritzen 2006, "Variance Shadow Maps"; cubed against leaks as in Majercik et al. 2019, section 5.2.
+// How much of a probe's surroundings lets it see a point. Its walls hold, for each direction, the inverse of how far away the nearest surface is
+// by the 1-norm: linear in the octahedral square on any plane, so that the look-up between four texels places a flat wall where it is
+// (bake_core/walls.py). How far behind that the point lies, as a part of the distance, fades as Chebyshev's bound does (Donnelly and Lauritzen
+// 2006, "Variance Shadow Maps"), cubed against leaks as in Majercik et al. 2019, section 5.2.
 float obVisibility(int v, ObVolume volume, ivec3 tile, vec3 fromProbe) {
-    float r = min(length(fromProbe), volume.distanceLimit);
-    if (volume.visibilityTexels == 0 || r == 0.0) {
+    float r = length(fromProbe);
+    if (volume.wallTexels == 0 || r == 0.0) {
         return 1.0;
     }
-    vec2 moments = OB_VISIBILITY(v, obTileCoordinates(volume, tile, volume.visibilityTexels, obDirToOct(fromProbe)));
-    float beyond = r - moments.x;
-    if (beyond <= 0.0) {
+    float inverse = OB_WALLS(v, obTileCoordinates(volume, tile, volume.wallTexels, obDirToOct(fromProbe)));
+    vec3 a = abs(fromProbe);
+    float behind = inverse * (a.x + a.y + a.z) * min(1.0, volume.distanceLimit / r) / volume.wallUnit - 1.0;
+    if (behind <= 0.0) {
         return 1.0;
     }
-    // float32 leaves noise of 1e-7 of the second moment in this difference; the bound says the spread is at least 0.3 % of the distance,
-    // a quarter of what the prefilter makes of a flat wall.
-    float variance = max(moments.y - moments.x * moments.x, 1e-5 * moments.y);
-    // The floor keeps 0/0 from a probe that touches what it sees.
-    float bound = variance / max(variance + beyond * beyond, 1e-37);
+    float soft = volume.visibilitySoftness * volume.visibilitySoftness;
+    float bound = soft / (soft + behind * behind);
     return max(bound * bound * bound, volume.visibilityFloor);
 }
 
@@ -72,12 +72,14 @@ vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 towar
     return chosen.w > 0.0 ? chosen.xyz / chosen.w : vec3(0.0);
 }
 
-// The first volume that contains a point, in the order of the spec; the nearest one where none does.
+// The finest volume that contains a point; the nearest one where none does.
 int obSelectVolume(vec3 position) {
     int nearest = 0;
     float least = 3.4e38;
-    for (int v = 0; v < OB_VOLUMES; ++v) {
-        float d = obDistanceSquared(obVolume(v), position);
+    for (int rank = 0; rank < OB_VOLUMES; ++rank) {
+        int v = obFinest(rank);
+        vec3 beyond = obBeyond(obVolume(v), position);
+        float d = dot(beyond, beyond);
         if (d < least) {
             least = d;
             nearest = v;
@@ -91,12 +93,30 @@ int obSelectVolume(vec3 position) {
 //   position  the point, in the frame of constants.glsl
 //   normal    unit shading normal, on the side that is seen
 //   wo        unit, from the point to the viewer; the normal itself where there is none
-vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
-    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, normal);
+//   toward    unit, the way that the plane faces on which light arrives: the normal, but for lobes that are not about it
+// A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the rest to the
+// next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest has.
+vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
+    int nearest = obSelectVolume(position);
+    vec4 sum = vec4(0.0);
+    float rest = 1.0;
+    for (int rank = 0; rank < OB_VOLUMES; ++rank) {
+        int v = obFinest(rank);
+        ObVolume volume = obVolume(v);
+        vec3 beyond = obBeyond(volume, position) / (0.5 * volume.spacing);
+        // So little for the nearest counts only where it is alone.
+        float reach = max(1.0 - min(max(beyond.x, max(beyond.y, beyond.z)), 1.0), v == nearest ? 1e-20 : 0.0);
+        if (reach > 0.0) {
+            sum += rest * reach * vec4(obIrradianceInVolume(v, position, normal, wo, toward), 1.0);
+            rest *= 1.0 - reach;
+        }
+        if (rest == 0.0) {
+            break;
+        }
+    }
+    return sum.xyz / sum.w;
 }
 
-// The same through the point, but on a plane that faces another way: for lobes that are not about the normal.
-//   toward    unit, any direction
-vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
-    return obIrradianceInVolume(obSelectVolume(position), position, normal, wo, toward);
+vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {
+    return obIrradianceToward(position, normal, wo, normal);
 }

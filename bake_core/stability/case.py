@@ -96,7 +96,7 @@ def maps(bundle: Bundle, output: str = "irradiance", volume: int = 0) -> F64:
     """The map of every probe outside solids, in flat order, without borders: (n, t, t, channels)."""
     v = bundle.volumes[volume]
     a = v.atlases[output]
-    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(v.states.sum())).astype(np.float64)
+    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), int((v.states == 1).sum())).astype(np.float64)
 
 
 def near(expected: float, found: F64, relative: float, note: str) -> Result:

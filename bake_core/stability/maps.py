@@ -30,7 +30,9 @@ def _spread(mean: F64, square: F64) -> F64:
 def _moments(size: float) -> Case:
     def run(baker: Baker) -> Result:
         at = _INSIDE * size
-        bundle = baker((scene(box(size), 0.5), {"volumes": one_probe((at[0], at[1], at[2]), 2 * size)}), stop=samples(4))
+        bundle = baker(
+            (scene(box(size), 0.5), {"volumes": one_probe((at[0], at[1], at[2]), 2 * size), "outputs": ["visibility"]}), stop=samples(4)
+        )
         found = maps(bundle, "visibility")[0].reshape(-1, 2)
         distance = slab_distances(texel_directions(64).reshape(-1, 3), at, size)
         weight = np.maximum(texel_directions(16).reshape(-1, 3) @ texel_directions(64).reshape(-1, 3).T, 0) ** VISIBILITY_SHARPNESS

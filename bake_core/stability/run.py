@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bake_core.errors import MachineError, OctobakeError
-from bake_core.stability import closed_rooms, crowds, geometry, maps, materials, placement, ranges
+from bake_core.stability import closed_rooms, crowds, geometry, leaks, maps, materials, placement, ranges
 from bake_core.stability.case import Baker, Case, Result
 
 CASES: tuple[Case, ...] = (
@@ -24,6 +24,7 @@ CASES: tuple[Case, ...] = (
     *ranges.CASES,
     *placement.CASES,
     *maps.CASES,
+    *leaks.CASES,
     *materials.CASES,
     *geometry.CASES,
     *crowds.CASES,

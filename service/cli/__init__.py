@@ -27,8 +27,11 @@ COMMANDS = (
     "wait",
     "status",
     "list",
+    "stop",
     "cancel",
     "fetch",
+    "token",
+    "warmup",
     "demo",
 )
 EXIT_CODES = "exit codes: 0 done; 2 bad input or usage; 3 failed; 4 out of budget before the target error; 5 a verification failed"

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
     from bake_core.rate import Rate, in_words
-    from bake_core.report import percent
+    from bake_core.report import audit_in_words, audit_of, percent
     from service.cli.plan import left_out_lines
     from service.cli.progress import count
 
@@ -46,8 +46,9 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
     ]
     for v in manifest["volumes"]:
         probes = v["probes"]
-        counts, inside = "×".join(map(str, v["counts"])), probes["count"] - probes["active"]
-        lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry")
+        counts, inside, unneeded = "×".join(map(str, v["counts"])), probes["states"].count(0), probes["states"].count(2)
+        none_asks = f", {unneeded} needed by no surface" if unneeded else ""
+        lines.append(f"volume     {v['name']}: {counts} probes, {probes['active']} active, {inside} inside geometry{none_asks}")
         for a in v["atlases"]:
             cost, file = percent(a["encoding_error"]), a["file"] or "no file, all texels are the same"
             lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {file}")
@@ -57,5 +58,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         lines += ["", f"{'samples':>9}{'rays':>9}{'seconds':>10}{'error':>10}"]
         lines += [f"{p['samples']:>9}{count(p['rays']):>9}{p['seconds']:>10.2f}{percent(p['error']):>10}" for p in report["curve"]]
         rates = {name: rate and Rate(**rate) for name, rate in report["rate"].items()}
+        audit = audit_of(report)
+        if audit is not None:
+            lines += ["", f"audit      {audit_in_words(audit)}"]
         lines += ["", *(f"rate       {in_words(rate)}, against {name}" for name, rate in rates.items())]
     return lines

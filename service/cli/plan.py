@@ -63,18 +63,24 @@ def _lines(made: Plan, spec: Spec, threads: int) -> list[str]:
         lines.append(f"volume     {v.name}: {'×'.join(map(str, v.counts))} probes from ({origin}) every ({spacing}) m")
     lines.append(f"kept       {', '.join(made.outputs)}: {in_bytes(made.atlas_bytes)} before compression")
     lines += left_out_lines([x.entry() for x in made.left_out])
+    if made.unneeded_probes:
+        size = in_bytes(made.unneeded_bytes)
+        unneeded = f"{made.unneeded_probes} of {made.probes} probes"
+        if spec.receivers == "surfaces":
+            lines.append(f"left out   {unneeded}: needed by no surface, for none lies in the cells around them; saves {size}")
+        else:
+            lines.append(f'could be   {unneeded} are needed by no surface; "receivers": "surfaces" would leave them out and save {size}')
     lines.append(f"speed      {made.paths_per_second / 1e6:.2f} M paths/s on {threads} threads, from a few probes")
     target, most = spec.stop.target_error, spec.stop.max_samples
+    between = f"{duration(made.least_seconds)} to {duration(made.greatest_seconds)}"
     if target is None or made.pilot_error is None:
-        lines.append(f"time       {duration(made.seconds)} of tracing, for {made.samples} samples")
+        lines.append(f"time       {duration(made.seconds)} of tracing ({between}), for {made.samples} samples")
     elif made.samples < most:
-        lines.append(
-            f"time       {duration(made.seconds)} of tracing, if about {made.samples} samples reach an error of {percent(target)};"
-        )
-        lines.append(f"           at most {duration(made.most_seconds)}, for {most} samples")
+        lines.append(f"time       {duration(made.seconds)} of tracing ({between}), if about {made.samples} samples reach an error")
+        lines.append(f"           of {percent(target)}; at most {duration(made.most_seconds)}, for {most} samples")
     else:
         lines.append(
-            f"time       {duration(made.most_seconds)} of tracing, for {most} samples; an error of {percent(target)} may need more"
+            f"time       {duration(made.seconds)} of tracing ({between}), for {most} samples; an error of {percent(target)} may need more"
         )
     lines.append(f"memory     {in_bytes(made.memory_bytes)}")
     return lines

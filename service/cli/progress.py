@@ -99,7 +99,12 @@ def describe_point(point: Point) -> str:
 
 def describe_result(result: Mapping[str, Any]) -> str:
     """What came of a bake: ``64 samples, error 1.3 %, 6.2 s, stopped at its target``."""
-    reasons = {"target": "stopped at its target", "samples": "stopped at its samples", "time": "stopped at its time"}
+    reasons = {
+        "target": "stopped at its target",
+        "samples": "stopped at its samples",
+        "time": "stopped at its time",
+        "interrupt": "stopped when told to",
+    }
     error = "error unknown" if result["error"] is None else f"error {percent(result['error'])}"
     return f"{result['samples']} samples, {error}, {duration(result['seconds'])}, {reasons[result['stopped']]}"
 

@@ -39,7 +39,7 @@ def connect(server: str) -> Iterator[Client]:
     from octobake_client import Client, JobFailed, OctobakeClientError, ServiceError, Unreachable
 
     try:
-        with Client(server) as client:
+        with Client(server, token=os.environ.get("OCTOBAKE_TOKEN")) as client:
             yield client
     except JobFailed as e:
         raise (InputError if e.exit_code == 2 else BakeError)(e.slug, e.message, e.where) from None

@@ -70,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
     for i, (position, normal) in enumerate(points):
         print(f"at {_text(position)} normal {_text(normal)}: irradiance {' '.join(f'{e:.6g}' for e in answer.irradiance[i])}")
         weights = [f"{p} × {w:.3f}" for p, w in zip(answer.probes[i], answer.weights[i], strict=True) if w > 0]
-        print(f"  volume {volumes[answer.volume[i]].name}, probes {', '.join(weights) or 'none: all around are inside geometry'}")
+        probes = ", ".join(weights) or "none: not one around it is active, and 0 is no measurement"
+        print(f"  volume {volumes[answer.volume[i]].name}, probes {probes}")
     return 0
 
 

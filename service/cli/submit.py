@@ -19,6 +19,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("--spec", metavar="SPEC", type=Path, required=True)
     parser.add_argument("--label", metavar="KEY=VALUE", action="append", default=[], type=_label, help="may be given several times")
     parser.add_argument("--priority", metavar="N", type=int, default=0, help="higher goes first")
+    parser.add_argument("--fresh", action="store_true", help="bake again what the service has baked before")
     parser.add_argument("--wait", action="store_true", help="follow it to its end")
     parser.add_argument(
         "--fetch", metavar="OUT", type=Path, help="wait, then download the bundle to a folder, or to a zip where it ends in .zip"
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         if isinstance(spec.environment, EquirectEnvironment) and not spec.environment.image.startswith("sha256:"):
             image = client.put_blob(beside(args.spec.parent)(spec.environment.image))
             spec = spec.model_copy(update={"environment": spec.environment.model_copy(update={"image": image})})
-        job = client.submit(scene.digest, spec.canonical(), labels=dict(args.label), priority=args.priority)
+        job = client.submit(scene.digest, spec.canonical(), labels=dict(args.label), priority=args.priority, fresh=args.fresh)
         if not (args.wait or args.fetch or args.fail_above_error is not None):
             print(json.dumps(job.document) if args.json else job.id)
             return 0

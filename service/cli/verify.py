@@ -89,16 +89,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(report: dict[str, Any]) -> str:
-    """A line for each camera and part, and one for the receivers: mean ratio, relMSE, and HDR-FLIP or the 95th percentile."""
-    from bake_core.verification_report import PARTS, number
+    """A line for each camera and part, and three for the receivers, two of which weigh probes as others do: ratio, relMSE, FLIP or p95."""
+    from bake_core.verification_report import BESIDE, PARTS, number
 
     rows = [("camera", "part", "mean ratio", "relMSE", "HDR-FLIP", "95th percentile")]
     for camera in report["cameras"]:
         for part in PARTS:
             f = camera[part]
             rows.append((camera["name"], part, number(f["mean_ratio"]), number(f["relmse"]), number(f["flip"]), ""))
-    f = report["receivers"]
-    rows.append(("receivers", "irradiance", number(f["mean_ratio"]), number(f["relmse"]), "", number(f["p95"])))
+    receivers = report["receivers"]
+    for part, f in [("irradiance", receivers), *((words, receivers["beside"][way]) for way, words in BESIDE.items())]:
+        rows.append(("receivers", part, number(f["mean_ratio"]), number(f["relmse"]), "", number(f["p95"])))
     if report["glossy"] is not None:
         g = report["glossy"]
         rows.append(("rays", "radiance", number(g["mean_ratio"]), number(g["relmse"]), "", number(g["p95"])))

@@ -10,18 +10,20 @@ from fastapi.responses import Response
 
 from service.blobs import DIGEST
 from service.problems import RequestError
-from service.routes.bodies import receive
+from service.routes.bodies import limited, receive
 from service.routes.common import Here, failures, unknown
 
 router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
-# Not a pattern here: a name that is no digest is a blob that cannot exist, which the handlers say in their own way.
-Name = Annotated[str, Path(description="`sha256:` and 64 hexadecimal digits, lower case.")]
+# In the document the pattern only: a name that is no digest is a blob that cannot exist, which the handlers say in their own way.
+Name = Annotated[
+    str, Path(description="`sha256:` and 64 hexadecimal digits, lower case.", json_schema_extra={"pattern": f"^{DIGEST.pattern}$"})
+]
 
 
 @router.head("/{digest}", operation_id="headBlob", summary="Is this blob here?", responses=failures(404, 422))
 def head_blob(digest: Name, service: Here) -> Response:
     """Answer 200 with the size where the blob is here, 404 where it must be uploaded."""
-    size = service.store.blob_size(_checked(digest))
+    size = service.store.use_blob(_checked(digest))
     if size is None:
         raise unknown("blob", digest)
     return Response(headers={"Content-Length": str(size), "ETag": f'"{digest}"'}, media_type="application/octet-stream")
@@ -38,17 +40,24 @@ def head_blob(digest: Name, service: Here) -> Response:
     },
 )
 async def put_blob(digest: Name, request: Request, service: Here) -> Response:
-    """Stream a file to disk; it is kept if its digest is the one in the path. Sending it again changes nothing."""
+    """Stream a file to disk; it is kept if its digest is the one in the path. Sending it again changes nothing.
+
+    With ``Expect: 100-continue`` a known one is answered before its bytes are sent.
+    """
     _checked(digest)
+    if await run_in_threadpool(service.store.use_blob, digest) is not None:
+        if request.headers.get("expect", "").lower() != "100-continue":
+            # It is on its way already, and an answer in the middle of it is an error to many clients.
+            async for _ in limited(request, service.settings.max_upload_bytes):
+                pass
+        return Response(status_code=204)
     with service.blobs.upload() as upload:
         await receive(request, upload, service.settings.max_upload_bytes)
         if upload.digest != digest:
             raise RequestError("blob.digest_mismatch", f"the bytes that arrived have {upload.digest}; send them again", "body", 422)
-        known = await run_in_threadpool(service.store.blob_size, digest)
-        if known is None:
-            await run_in_threadpool(upload.keep)
-            await run_in_threadpool(service.store.add_blob, digest, upload.size)
-    return Response(status_code=201 if known is None else 204)
+        await run_in_threadpool(upload.keep)
+        await run_in_threadpool(service.store.add_blob, digest, upload.size)
+    return Response(status_code=201)
 
 
 def _checked(digest: str) -> str:

@@ -11,13 +11,18 @@ from service.problems import MEDIA_TYPE, RequestError
 
 _TEXTS = {
     400: "What was sent cannot be read.",
+    401: "No token, or none of ours.",
+    403: "The token is not good for this; `detail` says which scope is.",
     404: "There is no such thing.",
     409: "It is not there yet, or never will be; `slug` says which.",
+    410: "Its time is up, and a clean-up has taken its files.",
     412: "A condition of the request does not hold.",
     413: "The body is too large.",
     415: "The body's media type is not one that is taken here.",
     416: "The range lies outside the file.",
     422: "What was sent is wrong; `slug`, `where` and `detail` say what.",
+    429: "Too many requests from this address; `Retry-After` says when the next may come.",
+    500: "A fault of the service itself.",
     503: "The service lacks something at the moment.",
 }
 

@@ -13,7 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from service.jobs import FINISHED, State
+from service.jobs import FINISHED
 from service.parts import Service
 from service.problems import RequestError
 
@@ -38,6 +38,12 @@ def event_stream(request: Request, service: Service, job: str) -> Response:
     return EventSourceResponse(_follow(service, job, int(given)), ping=PING_SECONDS, sep="\n")
 
 
+def _over(service: Service, job: str, last: int) -> bool:
+    """Whether a job has finished and all of its events up to `last` have been told; one that is queued again goes on."""
+    now = service.store.job(job)
+    return now is not None and now.state in FINISHED and not service.store.events(job, last, 1)
+
+
 async def _follow(service: Service, job: str, last: int) -> AsyncIterator[ServerSentEvent]:
     shown = None
     with service.hub.subscribe(job) as news:
@@ -51,11 +57,11 @@ async def _follow(service: Service, job: str, last: int) -> AsyncIterator[Server
                     last = event.id
                     data = {"at": datetime.fromtimestamp(event.at, UTC).isoformat(), **event.data}
                     yield ServerSentEvent(json.dumps(data), event=event.type, id=str(event.id))
-                    if event.type == "state" and State(event.data["state"]) in FINISHED:
-                        return
                 if len(events) == PAGE:
                     news.rows = True
                     continue
+                if await run_in_threadpool(_over, service, job, last):
+                    return
             progress = service.hub.progress(job)
             if progress is not None and progress != shown:
                 shown = progress

@@ -12,8 +12,6 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 
-from bake_core.scene import Scene as SceneArrays
-from bake_core.scene_files import load_scene_files
 from service import documents
 from service.parts import Service
 from service.problems import RequestError
@@ -58,10 +56,10 @@ async def create_scene(request: Request, service: Here) -> Response:
     with service.blobs.upload() as upload:
         await receive(request, upload, service.settings.max_upload_bytes)
         name = ZIP_NAME if kind == ZIP_TYPE else GLB_NAME
-        scene = await run_in_threadpool(load_scene_files, name, {name: upload.path})
+        outline, contents = await run_in_threadpool(service.outlines.read, name, {name: upload.path})
         await run_in_threadpool(upload.keep)
         await run_in_threadpool(service.store.add_blob, upload.digest, upload.size)
-        return await run_in_threadpool(_add, service, name, {name: upload.digest}, scene)
+        return await run_in_threadpool(_add, service, name, {name: upload.digest}, outline.digest, contents)
 
 
 @router.get("/{digest}", operation_id="getScene", summary="What is in a scene", responses=failures(404))
@@ -83,23 +81,13 @@ def _from_blobs(service: Service, body: Any) -> Response:
         if service.store.blob_size(digest) is None:
             raise RequestError("blob.unknown", f"{digest} has not been uploaded", f"body.files.{name}", 422)
         paths[name] = service.blobs.local_path(digest)
-    return _add(service, asked.root, asked.files, load_scene_files(asked.root, paths))
+    outline, contents = service.outlines.read(asked.root, paths)
+    return _add(service, asked.root, asked.files, outline.digest, contents)
 
 
-def _add(service: Service, root: str, files: Mapping[str, str], scene: SceneArrays) -> Response:
-    known = service.store.scene(scene.digest) is not None
-    contents = {
-        "triangles": scene.triangle_count,
-        "instances": len(scene.instance_mesh),
-        "materials": list(scene.materials.name),
-        "lights": len(scene.lights.kind),
-        "cameras": [camera.name for camera in scene.cameras],
-        "nodes": len(scene.nodes),
-        "bounds": scene.bounds.tolist(),
-        "ignored": list(scene.ignored),
-    }
-    service.outlines.add(scene)
-    service.store.add_scene(scene.digest, root, files, contents)
-    document = documents.Scene(digest=scene.digest, **contents)
-    headers = {"Location": f"/v1/scenes/{scene.digest}"}
+def _add(service: Service, root: str, files: Mapping[str, str], digest: str, contents: Mapping[str, Any]) -> Response:
+    known = service.store.scene(digest) is not None
+    service.store.add_scene(digest, root, files, contents)
+    document = documents.Scene(digest=digest, **contents)
+    headers = {"Location": f"/v1/scenes/{digest}"}
     return JSONResponse(document.model_dump(mode="json"), 200 if known else 201, headers)

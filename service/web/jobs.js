@@ -33,6 +33,11 @@ function row(bake) {
 async function refresh() {
   try {
     const answer = await fetch("/v1/bakes?limit=50");
+    if (answer.status === 401) {
+      note.textContent = "";
+      askForToken();
+      return;
+    }
     if (!answer.ok) throw new Error(`the service answered ${answer.status}`);
     const { items } = await answer.json();
     body.replaceChildren(...items.map(row));

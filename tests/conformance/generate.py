@@ -64,8 +64,8 @@ def query() -> dict[str, Any]:
     volumes = synthetic.volumes()
     positions, normals, wo = synthetic.points(80)
     answer = irradiance.sample(volumes, positions, normals, wo)
-    rows = zip(positions, normals, wo, answer.irradiance, answer.volume, answer.probes, answer.weights, strict=True)
-    keys = ("position", "normal", "wo", "irradiance", "volume", "probes", "weights")
+    rows = zip(positions, normals, wo, answer.irradiance, answer.volume, answer.volumes, answer.probes, answer.weights, strict=True)
+    keys = ("position", "normal", "wo", "irradiance", "volume", "volumes", "probes", "weights")
     return {
         "constants.glsl": bundle_constants(volumes).splitlines(),
         "volumes": [_volume(v) for v in volumes],
@@ -90,6 +90,7 @@ def _volume(volume: VolumeData) -> dict[str, Any]:
         "distance_limit": rounded(volume.distance_limit),
         "normal_bias": rounded(normal_bias),
         "view_bias": rounded(view_bias),
+        "visibility_softness": rounded(volume.parameters["visibility_softness"]),
         "visibility_floor": rounded(volume.parameters["visibility_floor"]),
         "probes": {"shape": list(probes.shape), "texels": rounded(probes.ravel())},
         "atlases": atlases,

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from bake_core.atlas import layout, pack
 from bake_core.bundle import Atlas, VolumeData
 
-PARAMETERS = {"normal_bias": 0.2, "view_bias": 0.8, "bias_scale": 0.225, "visibility_floor": 0.05, "visibility_sharpness": 50.0}
+# Shadows thirty times softer than a bake's: there, rounding of float32 in a point's direction is up to a thousandth of a shadow's width.
+PARAMETERS = {
+    "normal_bias": 0.2,
+    "view_bias": 0.8,
+    "bias_scale": 0.225,
+    "visibility_floor": 0.05,
+    "visibility_softness": 0.3,
+    "visibility_sharpness": 50.0,
+}
 
 
 def sequence(count: int, first: int = 0) -> NDArray[np.float64]:
@@ -34,7 +42,7 @@ def volume(
     seed: int = 0,
     inactive: tuple[int, ...] = (),
     moved: bool = False,
-    visibility: bool = True,
+    walls: bool = True,
     n: int = 4,
 ) -> VolumeData:
     """A volume whose texels are all different, and whose distances lie around its cell's size, so that all weights matter."""
@@ -42,10 +50,9 @@ def volume(
     diagonal = float(np.hypot(np.hypot(spacing[0], spacing[1]), spacing[2]))
     light = sequence(probes * n * n * 3, seed).reshape(probes, n, n, 3) * 2
     atlases = {"irradiance": atlas("irradiance", light, counts, inactive)}
-    if visibility:
-        mean = (0.25 + sequence(probes * n * n, seed + 7).reshape(probes, n, n, 1)) * diagonal
-        spread = 0.05 + 0.3 * sequence(probes * n * n, seed + 11).reshape(probes, n, n, 1)
-        atlases["visibility"] = atlas("visibility", np.concatenate([mean, mean**2 * (1 + spread**2)], -1), counts, inactive)
+    if walls:
+        distance = (0.25 + sequence(probes * n * n, seed + 7).reshape(probes, n, n, 1)) * diagonal
+        atlases["walls"] = atlas("walls", min(spacing) / distance, counts, inactive)
     states = np.ones(probes, np.uint8)
     states[list(inactive)] = 0
     offsets = ((sequence(probes * 3, seed + 3).reshape(probes, 3) - 0.5) * 0.5 * np.asarray(spacing) * moved).astype(np.float32)
@@ -66,12 +73,12 @@ def volume(
 def volumes() -> tuple[VolumeData, ...]:
     """Three volumes that together have what there is.
 
-    One inside another, probes off their lattice, dead ones, a cell of dead ones only, an axis of one probe, no visibility.
+    One inside another, probes off their lattice, dead ones, a cell of dead ones only, an axis of one probe, no walls.
     """
     return (
         volume("fine", (-1.0, 0.0, 0.5), (0.5, 0.25, 1.0), (2, 3, 2), seed=1, inactive=(0, 1), moved=True),
         volume("coarse", (-4.0, -2.0, -3.0), (3.0, 2.0, 2.5), (3, 3, 3), seed=2, inactive=(1, 13, 14, 16, 17, 22, 23, 25, 26)),
-        volume("flat", (6.0, 0.0, 0.0), (1.0, 1.0, 2.0), (3, 1, 2), seed=3, visibility=False),
+        volume("flat", (6.0, 0.0, 0.0), (1.0, 1.0, 2.0), (3, 1, 2), seed=3, walls=False),
     )
 
 

@@ -33,7 +33,9 @@ def volume_of(row: dict[str, Any]) -> VolumeData:
     counts = np.asarray(row["counts"])
     spacing = np.asarray(row["spacing"])
     several = spacing[counts > 1].min()
-    parameters = {"bias_scale": 1 / several} | {k: row.get(k, 0.0) for k in ("normal_bias", "view_bias", "visibility_floor")}
+    parameters = {"bias_scale": 1 / several} | {
+        k: row.get(k, 0.0) for k in ("normal_bias", "view_bias", "visibility_softness", "visibility_floor")
+    }
     return VolumeData(
         name="",
         origin=np.asarray(row["origin"]),
@@ -75,6 +77,7 @@ def test_irradiance_query() -> None:
     columns = {k: np.array([row[k] for row in data["queries"]]) for k in data["queries"][0]}
     found = irradiance.sample(volumes, columns["position"], columns["normal"], columns["wo"])
     np.testing.assert_array_equal(found.volume, columns["volume"])
+    np.testing.assert_array_equal(found.volumes, columns["volumes"])
     np.testing.assert_array_equal(found.probes, columns["probes"])
     np.testing.assert_allclose(found.weights, columns["weights"], atol=1e-6)
     np.testing.assert_allclose(found.irradiance, columns["irradiance"], atol=1e-6)

@@ -93,9 +93,11 @@ def test_every_slug_of_the_spec_is_documented() -> None:
 # --- errors ----------------------------------------------------------------------------------------------------------------------------
 
 # Words with a dot that are names of files, of modules or of places in a request.
-NO_SLUGS = r"(json|html|glb|gltf|zip|glsl|vert|frag|log|js|css|exr|cli|url|id|scene|bake|cameras|thresholds|worker_process|txt)"
+NO_SLUGS = (
+    r"(json|html|glb|gltf|zip|glsl|vert|frag|log|js|css|exr|cli|url|id|scene|bake|cameras|thresholds|worker_process|reader_process|txt)"
+)
 AREAS = (
-    "bake|bench|blob|bundle|camera|client|compute|demo|gltf|job|machine|request|sample|scene|service|settings|shaders|spec|thresholds"
+    "bake|bench|blob|bundle|camera|client|compute|demo|gltf|job|machine|request|sample|scene|service|settings|shaders|spec|thresholds|token"
     "|verification|vulkan"
 )
 
@@ -173,7 +175,7 @@ def test_the_reader_on_the_page_reads_a_bundle(baked: Bundle) -> None:
     manifest, tiles = names["read"](baked.path)
     assert manifest == baked.manifest
     volume = baked.volumes[0]
-    assert {output for _, output in tiles} == set(volume.atlases) and len(tiles) == 5
+    assert {output for _, output in tiles} == set(volume.atlases) and len(tiles) == 6
     for output, atlas in volume.atlases.items():
         found = tiles["room", output]
         assert found.shape == (12, atlas.tile, atlas.tile, atlas.texels.shape[-1])
@@ -185,7 +187,7 @@ def test_the_reader_on_the_page_reads_a_bundle(baked: Bundle) -> None:
             row, column = divmod(place, atlas.columns)
             at = np.s_[layer, row * atlas.tile : (row + 1) * atlas.tile, column * atlas.tile : (column + 1) * atlas.tile]
             np.testing.assert_array_equal(found[p], atlas.texels[at])
-    active = np.flatnonzero(volume.states)
+    active = np.flatnonzero(volume.states == 1)
     index = np.stack(np.unravel_index(active, volume.counts[::-1])[::-1], -1)
     positions = volume.origin + index * volume.spacing
     random = np.random.default_rng(0)
@@ -235,8 +237,8 @@ def test_every_command_and_option_is_documented() -> None:
     sections = dict(zip(COMMANDS, re.split(r"^## octobake [a-z-]+$", text, flags=re.MULTILINE)[1:], strict=True))
     for name, command in commands().items():
         section = sections[name]
-        kinds = [k for a in command._actions if isinstance(a, _SubParsersAction) for k in a.choices.values()]
-        actions = [a for c in (command, *kinds) for a in c._actions if not isinstance(a, _HelpAction)]
+        verbs = [verb for a in command._actions if isinstance(a, _SubParsersAction) for verb in a.choices.values()]
+        actions = [a for c in (command, *verbs) for a in c._actions if not isinstance(a, _HelpAction)]
         words = [w for a in actions for w in (a.option_strings or [str(a.metavar or a.dest)])]
         for word in words:
             # The service's settings have a page, and a test, of their own.

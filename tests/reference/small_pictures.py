@@ -44,7 +44,7 @@ def surroundings(spec: Spec) -> Environment:
 
 
 def constant_volume(irradiance: Sequence[float]) -> VolumeData:
-    volume = synthetic.volume("all", (0, 0, 0), (1, 1, 1), (1, 1, 1), visibility=False)
+    volume = synthetic.volume("all", (0, 0, 0), (1, 1, 1), (1, 1, 1), walls=False)
     whole = np.broadcast_to(np.asarray(irradiance, np.float64), (1, 4, 4, 3))
     volume.atlases["irradiance"] = synthetic.atlas("irradiance", whole, (1, 1, 1))
     return volume

@@ -30,7 +30,8 @@ def traced(scene: str, **changes: Any) -> State:
     path = SHARED / "specs" / f"{scene}.json"
     prepared = prepare(load_scene(SHARED / "scenes" / f"{scene}.glb"), load_spec(path).model_copy(update=changes), beside(path.parent))
     chosen = np.unique(np.linspace(0, prepared.probe_count - 1, _PROBES).astype(int))
-    few = replace(prepared, positions=prepared.positions[chosen], limits=prepared.limits[chosen])
+    positions, limits, units = (a[chosen] for a in (prepared.positions, prepared.limits, prepared.units))
+    few = replace(prepared, positions=positions, limits=limits, units=units)
     state = empty_state(few)
     state.add([trace_shard(few, (0, len(chosen)), (0, PILOT_SAMPLES), Allocation.start(len(chosen)), threads=2)])
     return state

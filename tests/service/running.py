@@ -89,12 +89,15 @@ class Server:
         self._log = data.with_name(data.name + ".log")
         self.start()
 
-    def start(self) -> None:
-        """Start, or start again, and wait until it answers."""
+    def start(self, wait: bool = True) -> None:
+        """Start, or start again, and if asked wait until it answers."""
         self._ready.unlink(missing_ok=True)
         with open(self._log, "a") as log:
             command = [*OCTOBAKE, "serve", "--port", "0", "--data", str(self.data), "--ready-file", str(self._ready), *self._options]
             self.process = subprocess.Popen(command, env=environment(), cwd=ROOT, stdout=log, stderr=log)
+        self.family: list[psutil.Process] = []
+        if not wait:
+            return
         wait_for(lambda: self._ready.exists() or self.process.poll() is not None, START_SECONDS)
         assert self.process.poll() is None, self.log()
         self.url = self._ready.read_text().strip()
@@ -120,8 +123,9 @@ class Server:
         return children
 
     def bake_worker(self) -> psutil.Process:
-        """The process that bakes: the one with the most memory."""
-        return max(self.workers(), key=lambda p: p.memory_info().rss)
+        """The process that bakes; waits for it where it is just being started again."""
+        worker: psutil.Process = wait_for(lambda: next(filter(_bakes, self.workers()), None), START_SECONDS)
+        return worker
 
     def kill(self) -> None:
         """SIGKILL."""
@@ -145,6 +149,13 @@ class Server:
         for process in left:
             process.kill()
         assert not left, f"left running: {left}"
+
+
+def _bakes(process: psutil.Process) -> bool:
+    try:
+        return "service.worker_process" in process.cmdline()
+    except psutil.Error:
+        return False
 
 
 def living(processes: list[psutil.Process], seconds: float) -> list[psutil.Process]:

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from octobake_client import Client, JobFailed, OctobakeClientError, Point, ServiceError, TransferError, Unreachable
+from octobake_client import Bake, Client, JobFailed, OctobakeClientError, Point, ServiceError, TransferError, Unreachable
 from octobake_client.sse import parse
 
 from bake_core.bundle import read_bundle
@@ -139,6 +139,43 @@ def test_an_interrupted_download_goes_on_and_a_wrong_one_is_noticed(server: Serv
             client.fetch(bake, tmp_path / "again.zip")
         assert not part.exists(), "so that the next try begins afresh"
         assert client.report(bake)["curve"]
+
+
+def test_a_request_is_sent_again_and_is_the_same_one(tmp_path: Path) -> None:
+    """The connection breaks, the service is busy, and is still at it: one key, one body, each time the whole of it."""
+    busy = httpx.Response(503, headers={"Retry-After": "0"}, json={"slug": "service.busy", "detail": "", "where": ""})
+    at_it = httpx.Response(409, headers={"Retry-After": "0"}, json={"slug": "request.key_in_flight", "detail": "", "where": ""})
+    refused = httpx.Response(409, headers={"Retry-After": "0"}, json={"slug": "job.not_finished", "detail": "", "where": ""})
+    script: list[httpx.Response | Exception] = []
+    sent: list[tuple[str, str | None, bytes]] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent.append((request.method, request.headers.get("idempotency-key"), request.read()))
+        following = script.pop(0)
+        if isinstance(following, Exception):
+            raise following
+        return following
+
+    broken = httpx.RemoteProtocolError("broken")
+    with Client("http://octobake", transport=httpx.MockTransport(answer)) as client:
+        script += [broken]
+        with pytest.raises(Unreachable):
+            client.bake("x")
+        assert len(sent) == 1, "nobody waits for a service that never answered"
+        path = tmp_path / "blob"
+        path.write_bytes(b"a file")
+        script += [httpx.Response(404), broken, busy, httpx.Response(201)]
+        client.put_blob(path)
+        assert [s[2] for s in sent[-3:]] == [b"a file"] * 3
+        sent.clear()
+        script += [broken, at_it, refused]
+        with pytest.raises(ServiceError) as caught:
+            client.submit("sha256:x", {})
+        assert caught.value.slug == "job.not_finished" and not script
+        assert len(set(sent)) == 1 and sent[0][1]
+        script += [broken]
+        with pytest.raises(Unreachable):
+            client.stop(Bake.of(dict.fromkeys(Bake.__dataclass_fields__, "x")))
 
 
 def test_a_failed_job_tells_why(server: Server, box: Path) -> None:

@@ -31,7 +31,7 @@ def test_every_state_can_be_reached_and_left_or_is_final() -> None:
     assert set(TRANSITIONS) == set(State)
     reached = set().union(*TRANSITIONS.values())
     assert reached == set(State)
-    assert {State.SUCCEEDED, State.FAILED, State.CANCELLED} == FINISHED
+    assert {State.SUCCEEDED, State.FAILED, State.CANCELLED, State.EXPIRED} == FINISHED
 
 
 @pytest.mark.parametrize("after", list(State))

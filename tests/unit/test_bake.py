@@ -62,17 +62,17 @@ def test_the_same_bytes_for_any_threads_shards_and_packing(tmp_path: Path) -> No
         "resolution": small,
     }
     (tmp_path / "scene.glb").write_bytes(glb)
-    assert baked_alike(tmp_path / "scene.glb", spec) == 2 * 6
+    assert baked_alike(tmp_path / "scene.glb", spec) == 2 * 9
 
 
 def test_the_same_bytes_with_textures_holes_gloss_and_a_sky(tmp_path: Path) -> None:
-    assert baked_alike(write_pavilion(tmp_path), pavilion_spec()) == 6
+    assert baked_alike(write_pavilion(tmp_path), pavilion_spec()) == 9
 
 
 def test_the_same_bytes_where_easy_probes_get_fewer_samples(tmp_path: Path) -> None:
     glb, spec = small_cornell(target_error=0.01, max_samples=4096)
     (tmp_path / "scene.glb").write_bytes(glb)
-    assert baked_alike(tmp_path / "scene.glb", spec) == 3
+    assert baked_alike(tmp_path / "scene.glb", spec) == 4
     manifest = read_bundle(tmp_path / "a").manifest
     assert manifest["sampling"]["mean_samples"] < manifest["samples"]
 
@@ -327,7 +327,7 @@ def test_what_cannot_be_stored_is_an_error_and_never_an_infinity(tmp_path: Path)
 def test_bright_light_is_stored_in_full(tmp_path: Path) -> None:
     glb, spec = closed_box(0.5, 50_000.0)
     manifest = bake_into(tmp_path, glb, {**spec, "stop": {"target_error": None, "max_samples": 16}}).manifest
-    (irradiance, _) = manifest["volumes"][0]["atlases"]
+    (irradiance,) = manifest["volumes"][0]["atlases"]
     assert irradiance["encoding"] == "float"
     assert maps(read_bundle(tmp_path / "out")).mean() == pytest.approx(np.pi * 100_000, rel=0.01)
 
@@ -367,7 +367,8 @@ def test_all_outputs(tmp_path: Path) -> None:
         tmp_path, glb, {**spec, "outputs": everything, "resolution": small, "stop": {"target_error": None, "max_samples": 16}}
     )
     bundle = read_bundle(tmp_path / "out")
-    assert list(bundle.volumes[0].atlases) == everything
+    assert list(bundle.volumes[0].atlases) == [*everything, "walls"]
+    assert (tmp_path / "out" / "report.html").read_text().count("irradiance.exr") == 1
     assert not any("bytes" in x for x in result.manifest["left_out"])
     described = {a["output"]: a for a in result.manifest["volumes"][0]["atlases"]}
     assert [described[o]["interior"] for o in everything] == [4, 8, 16, 32, 16]
@@ -397,7 +398,8 @@ def test_one_output_alone(tmp_path: Path) -> None:
     for output in ("irradiance", "visibility", "radiance", "distance", "normal"):
         chosen = {**spec, "outputs": [output], "stop": {"target_error": None, "max_samples": 4}}
         manifest = bake_into(tmp_path, glb, chosen, output).manifest
-        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output]
+        walls = ["walls"] if output == "visibility" else []
+        assert [a["output"] for a in manifest["volumes"][0]["atlases"]] == [output, *walls]
         assert {x["what"] for x in manifest["left_out"] if "bytes" in x} == {
             "irradiance",
             "visibility",
@@ -502,7 +504,7 @@ def test_nothing_but_sky(tmp_path: Path) -> None:
     w = GlbWriter()
     w.node("empty")
     grid = {"origin": [0, 0, 0], "spacing": [1, 1, 1], "counts": [1, 2, 1]}
-    bake_into(tmp_path, w.to_glb(), {"volumes": [grid], "environment": sky(2.0)})
+    bake_into(tmp_path, w.to_glb(), {"volumes": [grid], "environment": sky(2.0), "outputs": ["irradiance", "visibility"]})
     bundle = read_bundle(tmp_path / "out")
     np.testing.assert_allclose(maps(bundle), 2 * np.pi, rtol=1e-3)
     assert bundle.manifest["error"]["value"] < 1e-9 and bundle.manifest["stopped"] == "target"

@@ -26,7 +26,7 @@ STOP = {"target_error": None, "max_samples": 4}
 
 
 def small_spec(**changes: Any) -> Spec:
-    return parse_spec({**closed_box(0.5, 1.0)[1], "stop": STOP, **changes})
+    return parse_spec({**closed_box(0.5, 1.0)[1], "outputs": ["irradiance", "visibility"], "stop": STOP, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def refused(path: Path) -> BundleError:
 
 
 def test_what_is_in_it(baked: Path) -> None:
-    expected = {"manifest.json", "box.irradiance.exr", "box.visibility.exr", "box.probes.exr"}
+    expected = {"manifest.json", "box.irradiance.exr", "box.visibility.exr", "box.walls.exr", "box.probes.exr"}
     expected |= {f"shaders/{n}" for n in ("octahedral.glsl", "grid.glsl", "irradiance.glsl", "trace.glsl", "constants.glsl", "README.md")}
     assert set(files(baked / "bundle")) == expected
     assert {p.name for p in (baked / "bundle").iterdir()} >= {"report.json", "report.html", "report.svg", "report.png"}

@@ -292,11 +292,11 @@ def test_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, spec_file = write(tmp_path, *closed_box(0.5, 1.0))
     assert main(["plan", scene, "--spec", spec_file]) == 0
     text = capsys.readouterr().out
-    for word in ("2×2×2", "irradiance, visibility", "left out", "saves", "time", "memory"):
+    for word in ("2×2×2", "irradiance", "left out", "saves", "time", "memory"):
         assert word in text
     assert main(["plan", scene, "--spec", spec_file, "--json", "--threads", "1"]) == 0
     told = document(capsys)
-    assert told["probes"] == 8 and told["outputs"] == ["irradiance", "visibility"] and told["seconds"] > 0
+    assert told["probes"] == 8 and told["outputs"] == ["irradiance"] and told["seconds"] > 0
     assert told["measured"] is None and told["left_out"][0].keys() == {"what", "why", "bytes"}
     assert main(["plan", scene, "--spec", spec_file, "--measure", "--threads", "1"]) == 0
     assert "left out" in (text := capsys.readouterr().out) and "same texels box.irradiance" in text and "others" not in text
@@ -311,11 +311,12 @@ def test_info(baked: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "sha256:",
         "1×1×1 probes, 1 active",
         "irradiance",
-        "stored as float",
+        "stored as half",
         "left out",
         "seconds",
         "rays",
         "against samples",
+        "audit      256 irradiance texels err by",
     ):
         assert word in text
     assert main(["info", str(baked), "--json"]) == 0

@@ -24,7 +24,7 @@ def filled(volume: VolumeData, output: str, texels: np.ndarray) -> VolumeData:
 def in_the_open(counts: tuple[int, int, int] = (3, 3, 3), n: int = 8) -> VolumeData:
     """Spacing 1, every probe sees everything."""
     volume = synthetic.volume("open", (0, 0, 0), (1, 1, 1), counts, n=n)
-    return filled(volume, "visibility", np.array([volume.distance_limit, volume.distance_limit**2]))
+    return filled(volume, "walls", np.array([0.0]))
 
 
 def test_the_same_light_everywhere_is_answered_everywhere() -> None:
@@ -38,7 +38,7 @@ def test_the_same_light_everywhere_is_answered_everywhere() -> None:
 
 
 def test_at_a_probe_the_answer_is_the_probes_own() -> None:
-    """Whatever its neighbours hold, and although visibility says that it is not seen."""
+    """Whatever its neighbours hold, and although its walls say that it is not seen."""
     volume = synthetic.volume("v", (-1, 2, 5), (0.5, 2, 1), (3, 4, 2), seed=4)
     index = np.stack(np.unravel_index(np.arange(24), (2, 4, 3))[::-1], -1)
     found = irradiance.sample((volume,), volume.origin + volume.spacing * index, np.tile([0.0, 0.6, 0.8], (24, 1)))
@@ -65,7 +65,7 @@ def test_a_wall_between_probes_keeps_the_other_sides_light_out() -> None:
     cosine = np.maximum(side[..., 0] * towards[..., 0], 1e-6)
     distance = np.minimum(0.5 / cosine, volume.distance_limit)
     volume = filled(volume, "irradiance", lit)
-    volume = filled(volume, "visibility", np.stack([distance, distance**2], -1))
+    volume = filled(volume, "walls", 1 / (distance * np.abs(towards).sum(-1))[..., None])
     leaked = irradiance.sample((volume,), [[0.499, 0.5, 0.5]], [[-1.0, 0.0, 0.0]]).irradiance[0, 0]
     assert 0 < leaked < 1e-4
     away = irradiance.sample(
@@ -101,23 +101,48 @@ def test_points_outside_are_answered_by_the_nearest_cell_of_the_nearest_volume()
     np.testing.assert_array_equal(found.probes[2][found.weights[2] > 0], [4])
 
 
-def test_where_volumes_overlap_the_first_answers() -> None:
+def test_where_volumes_overlap_the_finest_answers_and_the_first_of_equals() -> None:
     whole, part = in_the_open(), replace(in_the_open((2, 2, 2)), origin=np.array([0.5, 0.5, 0.5]))
     inside = np.array([[0.75, 0.75, 0.75], [0.25, 0.25, 0.25]])
     np.testing.assert_array_equal(irradiance.select_volume((part, whole), inside), [0, 1])
     np.testing.assert_array_equal(irradiance.select_volume((whole, part), inside), [0, 0])
+    fine = replace(part, spacing=np.full(3, 0.5))
+    np.testing.assert_array_equal(irradiance.select_volume((whole, fine), inside), [1, 0])
+
+
+def test_a_fine_volume_fades_into_the_coarse_one_around_it() -> None:
+    """The fine one holds 2, the coarse one 1; half a fine spacing beyond the fine box nothing is left of it, and there is no step."""
+    coarse = filled(in_the_open((5, 5, 5)), "irradiance", np.array(1.0))
+    fine = filled(in_the_open((3, 3, 3)), "irradiance", np.array(2.0))
+    fine = replace(fine, origin=np.full(3, 1.0), spacing=np.full(3, 0.5))
+    x = np.linspace(0, 4, 401)
+    positions = np.stack([x, np.full(401, 1.5), np.full(401, 1.5)], -1)
+    for volumes in ((coarse, fine), (fine, coarse)):
+        found = irradiance.sample(volumes, positions, np.tile([0.0, 1.0, 0.0], (401, 1)))
+        expected = 1 + np.clip(np.minimum(x - 0.75, 2.25 - x) / 0.25, 0, 1)
+        np.testing.assert_allclose(found.irradiance[:, 0], expected, rtol=1e-12)
+        np.testing.assert_allclose(found.weights.sum(-1), 1, rtol=1e-12)
+        assert found.weights.shape == (401, 16)
+        assert set(found.volume) == {0, 1}
+
+
+def test_neighbours_fade_into_each_other_and_the_nearest_answers_beyond_both() -> None:
+    """Two volumes side by side: the first has its own box, the second's half a spacing beyond it changes hands without a step."""
+    a = filled(in_the_open((3, 3, 3)), "irradiance", np.array(1.0))
+    b = replace(filled(in_the_open((3, 3, 3)), "irradiance", np.array(3.0)), origin=np.array([2.0, 0, 0]))
+    x = np.array([1.0, 2.0, 2.25, 2.5, 4.0, 4.4, 9.0, -9.0])
+    found = irradiance.sample((a, b), np.stack([x, np.ones(8), np.ones(8)], -1), np.tile([0.0, 1.0, 0.0], (8, 1)))
+    np.testing.assert_allclose(found.irradiance[:, 0], [1, 1, 2, 3, 3, 3, 3, 1], rtol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
 def test_the_answer_does_not_depend_on_the_unit_of_length(scale: float) -> None:
     volume = synthetic.volume("v", (-1, 0, 0), (1, 1, 1), (3, 3, 3), seed=5)
-    moments = volume.atlases["visibility"]
     scaled = replace(
         volume,
         origin=volume.origin * scale,
         spacing=volume.spacing * scale,
         distance_limit=volume.distance_limit * scale,
-        atlases={**volume.atlases, "visibility": replace(moments, texels=(moments.texels * [scale, scale * scale]).astype(np.float32))},
     )
     positions = np.stack([synthetic.sequence(100, k * 100) for k in range(3)], -1) * 2 - [1, 0, 0]
     normals = np.tile([0.36, 0.48, 0.8], (100, 1))

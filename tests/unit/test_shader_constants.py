@@ -28,9 +28,9 @@ def test_constants_are_the_same_text_every_time_and_read_back() -> None:
             volume.atlases["irradiance"].columns,
             volume.atlases["irradiance"].rows,
             4,
-            4 * ("visibility" in volume.atlases),
+            4 * ("walls" in volume.atlases),
         ]
-        expected += [volume.distance_limit, *surface_bias(volume), 0.05]
+        expected += [volume.spacing.min(), volume.distance_limit, *surface_bias(volume), 0.3, 0.05]
         np.testing.assert_array_equal(np.array(numbers, np.float32), np.array(expected, np.float32))
 
 
@@ -38,7 +38,7 @@ def test_every_field_of_the_struct_is_filled_in_its_order() -> None:
     struct = re.search(r"struct ObVolume \{(.*?)\};", shader_text("grid.glsl"), re.DOTALL)
     assert struct
     types = re.findall(r"^\s*(\w+) \w+;", struct[1], re.MULTILINE)
-    assert types == ["vec3", "vec3", "ivec3", "ivec2", "int", "int", "float", "float", "float", "float"]
+    assert types == ["vec3", "vec3", "ivec3", "ivec2", "int", "int", *["float"] * 6]
 
 
 def test_a_frame_far_from_zero_keeps_its_millimetres() -> None:
@@ -69,6 +69,6 @@ def test_probe_table_fills_up_a_packed_layout_with_dead_probes() -> None:
 
 def test_atlases_of_two_layouts_are_refused() -> None:
     volume = synthetic.volume("v", (0, 0, 0), (1, 1, 1), (4, 1, 1))
-    mixed = {**volume.atlases, "visibility": replace(volume.atlases["visibility"], columns=2, rows=2)}
+    mixed = {**volume.atlases, "walls": replace(volume.atlases["walls"], columns=2, rows=2)}
     with pytest.raises(ValueError, match="one tile layout"):
         bundle_constants((replace(volume, atlases=mixed),))

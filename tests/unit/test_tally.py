@@ -45,6 +45,7 @@ def empty() -> State:
         samples=0,
         taken=np.zeros((PROBES, HALVES), np.int64),
         eighths=np.full((PROBES, HALVES), FULL),
+        needed=np.ones(PROBES, np.bool_),
         irradiance=np.zeros((PROBES, SCRAMBLES, TEXELS, 3), np.float32),
         radiance=np.zeros((PROBES, HALVES, 16, 3), np.float32),
         visibility=np.zeros((PROBES, 2, 2, 2), np.float32),
@@ -164,6 +165,7 @@ def test_the_bound_of_radiance_holds_95_times_out_of_100(probes: int, loosest: f
             empty(),
             samples=32,
             taken=np.full((probes, HALVES), 16),
+            needed=np.ones(probes, np.bool_),
             backface=np.zeros(probes, np.float32),
             radiance=(16 * means).astype(np.float32),
         )

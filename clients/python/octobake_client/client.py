@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TypeVar
+from uuid import uuid4
 
 import httpx
 
@@ -32,18 +33,28 @@ class Client:
     timeout : float
         Seconds for one answer.
     patience : float
-        How long, in seconds, :meth:`wait`, :meth:`events` and :meth:`fetch` go on trying when the connection breaks, as it does when
-        the service is restarted.
+        How long, in seconds, a call goes on trying when the connection breaks, as it does when the service is restarted, or when the
+        service is too busy. A service that has never answered is not waited for.
+    token : str, optional
+        What ``octobake token create`` printed; none is needed where the service listens on loopback only.
     transport : httpx.BaseTransport, optional
         In place of the network.
     """
 
     def __init__(
-        self, base_url: str, *, timeout: float = 60.0, patience: float = 30.0, transport: httpx.BaseTransport | None = None
+        self,
+        base_url: str,
+        *,
+        timeout: float = 60.0,
+        patience: float = 30.0,
+        token: str | None = None,
+        transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.patience = patience
+        self._met = False
+        headers = {"User-Agent": "octobake-client", **({"Authorization": f"Bearer {token}"} if token else {})}
         try:
-            self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers={"User-Agent": "octobake-client"})
+            self._http = httpx.Client(base_url=base_url, timeout=timeout, transport=transport, headers=headers)
         except httpx.InvalidURL as e:
             raise OctobakeClientError("client.bad_url", f"is not a URL: {e}", base_url) from None
 
@@ -66,10 +77,9 @@ class Client:
             digest = file_digest(path)
             url = f"/v1/blobs/{digest}"
             if self._send("HEAD", url, missing=True).status_code == 404:
-                with open(path, "rb") as f:
-                    # A length, so that the service can refuse what is too large before it is sent.
-                    headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
-                    self._send("PUT", url, content=iter(lambda: f.read(CHUNK), b""), headers=headers)
+                # A length, so that the service can refuse what is too large before it is sent.
+                headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
+                self._send("PUT", url, file=path, headers=headers)
             return digest
         except OSError as e:
             raise OctobakeClientError("client.unreadable", f"cannot be read: {e.strerror}", str(path)) from None
@@ -82,15 +92,29 @@ class Client:
 
     # Jobs
 
-    def submit(self, scene: str, spec: Mapping[str, Any], *, labels: Mapping[str, str] | None = None, priority: int = 0) -> Bake:
-        """Queue a bake of the scene with this digest."""
+    def submit(
+        self,
+        scene: str,
+        spec: Mapping[str, Any],
+        *,
+        labels: Mapping[str, str] | None = None,
+        priority: int = 0,
+        fresh: bool = False,
+        key: str | None = None,
+    ) -> Bake:
+        """Queue a bake of the scene with this digest; one that was made of the same before is the answer, unless it shall be `fresh`.
+
+        However often it has to be sent, one bake comes of it. With a `key` of your own that holds for a day, over calls and processes.
+        """
         body = {"scene": scene, "spec": dict(spec), "labels": dict(labels or {}), "priority": priority}
-        return Bake.of(self._send("POST", PATHS[Bake], json=body).json())
+        headers = {"Idempotency-Key": key or uuid4().hex, **({"Cache-Control": "no-cache"} if fresh else {})}
+        return Bake.of(self._send("POST", PATHS[Bake], json=body, headers=headers).json())
 
     def verify(self, bake: Bake | str, *, labels: Mapping[str, str] | None = None, priority: int = 0, **options: Any) -> Verification:
         """Queue a verification of a finished bake; `options` are the request's further keys (see the OpenAPI document)."""
         body = {"bake": bake if isinstance(bake, str) else bake.id, "labels": dict(labels or {}), "priority": priority, **options}
-        return Verification.of(self._send("POST", PATHS[Verification], json=body).json())
+        headers = {"Idempotency-Key": uuid4().hex}
+        return Verification.of(self._send("POST", PATHS[Verification], json=body, headers=headers).json())
 
     def bake(self, job: str) -> Bake:
         """A bake as it stands now."""
@@ -115,6 +139,10 @@ class Client:
     def cancel(self, job: AnyJob) -> AnyJob:
         """Ask for a job's end; answers it as it stands then."""
         return type(job).of(self._send("POST", f"{PATHS[type(job)]}/{job.id}:cancel").json())
+
+    def stop(self, bake: Bake) -> Bake:
+        """End a running bake with the passes it has; answers it as it stands then."""
+        return Bake.of(self._send("POST", f"{PATHS[Bake]}/{bake.id}:stop", again=False).json())
 
     def events(self, job: Job, after: int = 0) -> Iterator[Event]:
         """A job's events from the first after `after` until it has finished, across broken connections."""
@@ -144,12 +172,18 @@ class Client:
 
         `point` is told every point of a bake's curve, those first that there are already; `progress` only the latest.
         """
-        for event in self.events(job):
-            if event.type == "progress" and progress:
-                progress(Progress.of(event.document))
-            if event.type == "pass" and point:
-                point(Point.of(event.document))
-        return self._job(type(job), job.id)
+        last = 0
+        while True:
+            for event in self.events(job, last):
+                last = event.id or last
+                if event.type == "progress" and progress:
+                    progress(Progress.of(event.document))
+                if event.type == "pass" and point:
+                    point(Point.of(event.document))
+            now = self._job(type(job), job.id)
+            # One that was queued again has finished before, and goes on.
+            if now.done:
+                return now
 
     # Downloads
 
@@ -188,19 +222,41 @@ class Client:
     def _job(self, kind: type[AnyJob], job: str) -> AnyJob:
         return kind.of(self._send("GET", f"{PATHS[kind]}/{job}").json())
 
-    def _send(self, method: str, url: str, *, missing: bool = False, **arguments: Any) -> httpx.Response:
-        """One request; raises for every answer that is no success, but for 404 where `missing` is expected."""
-        try:
-            answer = self._http.request(method, url, **arguments)
-        except httpx.TransportError as e:
-            raise Unreachable(str(self._http.base_url.join(url)), _reason(e)) from None
-        if answer.is_success or (missing and answer.status_code == 404):
-            return answer
+    def _send(
+        self, method: str, url: str, *, missing: bool = False, again: bool = True, file: Path | None = None, **arguments: Any
+    ) -> httpx.Response:
+        """One request; raises for every answer that is no success, but for 404 where `missing` is expected.
+
+        It is sent `again` where nobody can know what became of it, and where the service asks for that; `file` is its body, read anew each
+        time.
+        """
+        contact = time.monotonic()
+        while True:
+            try:
+                answer = self._once(method, url, file, arguments)
+            except httpx.TransportError as e:
+                if not (again and self._met):
+                    raise Unreachable(str(self._http.base_url.join(url)), _reason(e)) from None
+                self._pause(contact, url, _reason(e))
+                continue
+            self._met = True
+            if answer.is_success or (missing and answer.status_code == 404):
+                return answer
+            wait = _wish(answer)
+            if wait is None or time.monotonic() + wait - contact > self.patience:
+                break
+            time.sleep(wait)
         if method == "HEAD":
             # An answer to HEAD has no body to say why: ask again for one that has, and for no more than a byte should it be there now.
             self._send("GET", url, headers={"Range": "bytes=0-0"})
             return self._send("HEAD", url)
         raise ServiceError.of(answer)
+
+    def _once(self, method: str, url: str, file: Path | None, arguments: Mapping[str, Any]) -> httpx.Response:
+        if file is None:
+            return self._http.request(method, url, **arguments)
+        with open(file, "rb") as f:
+            return self._http.request(method, url, content=iter(lambda: f.read(CHUNK), b""), **arguments)
 
     def _pause(self, contact: float, url: str, reason: str) -> None:
         if time.monotonic() - contact > self.patience:
@@ -240,3 +296,10 @@ class Client:
 
 def _reason(error: httpx.TransportError) -> str:
     return str(error) or type(error).__name__
+
+
+def _wish(answer: httpx.Response) -> float | None:
+    """Seconds after which a service that is busy, full or still at the same request asks for it again; None where it does not."""
+    after = answer.headers.get("Retry-After", "")
+    busy = answer.status_code in (429, 503, 507) or (answer.status_code == 409 and ServiceError.of(answer).slug == "request.key_in_flight")
+    return float(after) if busy and after.isdecimal() else None

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from octobake_client.errors import JobFailed
 
-FINISHED = frozenset({"succeeded", "failed", "cancelled"})
+FINISHED = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,65 @@
+"""Probes move towards walls as the closed form says, never through one; and a bundle says where they stand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bake_core.bake import prepare
+from bake_core.examples import box_sides, cornell, quads_part, two_rooms
+from bake_core.gltf.writer import GlbWriter
+from bake_core.relocation import FARTHEST
+from bake_core.spec import parse_spec
+from tests.baking import bake_example
+from tests.unit.test_transport import load_example
+
+
+def moved(glb: bytes, **volume: object) -> np.ndarray:
+    spec = parse_spec({"version": 1, "volumes": [volume], "probes": "relocated"})
+    return np.asarray(prepare(load_example(glb), spec).offsets)
+
+
+def test_a_probe_half_a_cell_from_a_wall_moves_by_fifteen_hundredths() -> None:
+    """In two rooms every outermost probe has a wall half a metre off on one side of each axis: m = 3 d² / (6 d + 2 s) = 0.15."""
+    glb, document = two_rooms()
+    found = moved(glb, **document["volumes"][0]).reshape(4, 3, 8, 3)
+    np.testing.assert_allclose(found[..., 0], np.array([-0.15, 0, 0, 0.15, -0.15, 0, 0, 0.15]) * np.ones((4, 3, 1)), atol=0.01)
+    np.testing.assert_allclose(np.delete(found[..., 1], 2, 1), np.array([-0.15, 0])[None, :, None] * np.ones((4, 1, 8)), atol=1e-6)
+    np.testing.assert_allclose(found[:, 0, :, 2], np.array([-0.15, 0, 0, 0.15])[:, None] * np.ones((1, 8)), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_between_two_walls_a_probe_stands_in_the_middle(scale: float) -> None:
+    w = GlbWriter()
+    sides = [q * scale for q in box_sides((0, 0, 0), (1, 8, 8))]
+    w.node("slot", mesh=w.mesh("slot", [quads_part(sides, w.material("wall", (0.5,) * 3))]))
+    found = moved(w.to_glb(), origin=[0.3 * scale, 4 * scale, 4 * scale], spacing=[scale] * 3, counts=[1, 1, 1])
+    np.testing.assert_allclose(found[0] / scale, [0.2, 0, 0], atol=1e-5)
+
+
+def test_backs_draw_nobody_and_double_sided_walls_do() -> None:
+    """Outside of a box whose walls face inwards, there is nothing but backs; the same walls double-sided are walls."""
+    for double_sided, expected in ((False, 0.0), (True, 3 * 0.25 / (3 + 2))):
+        w = GlbWriter()
+        wall = w.material("wall", (0.5,) * 3, double_sided=double_sided)
+        w.node("box", mesh=w.mesh("box", [quads_part(box_sides((0, -9, -9), (1, 9, 9)), wall)]))
+        found = moved(w.to_glb(), origin=[-0.5, 0, 0], spacing=[1, 1, 1], counts=[1, 1, 1])
+        np.testing.assert_allclose(found[0], [expected, 0, 0], atol=1e-5)
+
+
+def test_nobody_goes_far_or_through_anything(tmp_path: Path) -> None:
+    """In the Cornell box, boxes and all: within 0.45 of a spacing, as active as before, and the bundle says where they stand."""
+    glb, document = cornell()
+    grid = {**document["volumes"][0], "spacing": [0.5] * 3, "counts": [4, 4, 4]}
+    kept: dict[str, Any] = {"volumes": [grid], "stop": {"target_error": None, "max_samples": 4}, "outputs": ["irradiance", "visibility"]}
+    still = bake_example(tmp_path, (glb, document), **kept).volumes[0]
+    bundle = bake_example(tmp_path, (glb, document), **kept, probes="relocated")
+    (volume,) = bundle.volumes
+    assert volume.offsets.any() and (np.abs(volume.offsets) <= FARTHEST * 0.5).all()
+    assert (volume.states >= still.states).all()
+    told = np.array(bundle.manifest["volumes"][0]["probes"]["offsets"], np.float32)
+    np.testing.assert_array_equal(told, volume.offsets)
+    np.testing.assert_allclose(volume.positions() - still.positions(), volume.offsets, atol=1e-6)
