@@ -63,7 +63,9 @@ def _service(out: Path) -> Iterator[str]:
 
     ready = out / "service.url"
     ready.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--data", str(out / "data"), "--ready-file", str(ready)]
+    # Whatever the environment says of a service that others reach: this one is for this command alone.
+    alone = ["--host", "127.0.0.1", "--port", "0", "--require-token", "0"]
+    command = [sys.executable, "-m", "service.cli", "serve", *alone, "--data", str(out / "data"), "--ready-file", str(ready)]
     with open(out / "service.log", "w") as log, subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log) as process:
         try:
             deadline = time.monotonic() + START_SECONDS
