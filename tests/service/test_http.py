@@ -215,7 +215,7 @@ def test_an_unknown_scene(http: InProcess) -> None:
         (json.dumps({"scene": DIGEST, "spec": {}, "labels": {"a": "\0"}}).encode(), 422, "request.invalid", "body.labels.a"),
         (json.dumps({"scene": DIGEST, "spec": {}, "labels": {"a": "\ud800"}}).encode(), 422, "request.invalid", "body.labels.a"),
         (json.dumps({"scene": DIGEST, "spec": {"volumes": []}}).encode(), 422, "spec.invalid", "spec: volumes"),
-        (json.dumps({"scene": DIGEST, "spec": {"probes": 1}}).encode(), 422, "spec.unknown_key", "spec: probes"),
+        (json.dumps({"scene": DIGEST, "spec": {"rays": 1}}).encode(), 422, "spec.unknown_key", "spec: rays"),
         (json.dumps({"scene": DIGEST, "spec": box_spec()}).encode(), 422, "scene.unknown", "body.scene"),
     ],
 )
