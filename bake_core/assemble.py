@@ -105,7 +105,7 @@ def assemble(
         entries.append(entry)
         data.append(content)
         size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
-        saved += np.array([(content.states == state).sum() * size for state in (0, 2)])
+        saved += np.array([(content.states == left_out_as).sum() * size for left_out_as in (0, 2)])
         first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()

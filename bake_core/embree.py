@@ -29,7 +29,6 @@ RAYHIT_WORDS = 24
 _COUNT_LOW, _COUNT_HIGH = 22, 23
 # Rays are 16-byte aligned; a cache line keeps a ray from straddling two.
 RAYHIT_ALIGNMENT = 64
-INVALID_ID = np.uint32(0xFFFFFFFF)
 
 _TRIANGLE, _INSTANCE = 0, 121
 _BUFFER_INDEX, _BUFFER_VERTEX = 0, 1

@@ -6,17 +6,15 @@ What arrives is measured as probes measure it: everything but what comes straigh
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.embree import new_rayhit
-from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel
 from bake_core.light_field import Traces, arriving, light_field, trace
+from bake_core.receiver_irradiance import CANCELLED, DONE, estimate
 from bake_core.sampling import mix64, reverse_bits
 from bake_core.scene import Scene
 from bake_core.trace_check import Rays, draw_rays
@@ -29,9 +27,6 @@ F64 = NDArray[np.float64]
 COUNT = 2048
 _SCRAMBLES = 4
 _SEED = 0x0C70BA51
-_CANCELLED, _DONE = 1, 0
-# Rays a thread takes at once: a fraction of a second's work.
-_CHUNK = 32
 
 
 @entry_kernel
@@ -42,7 +37,7 @@ def _radiance_kernel(t, ray, lines, first, samples, seed, cancelled, out):  # ty
         line = lines[i]
         for scramble in range(out.shape[0]):
             if cancelled[0]:
-                return _CANCELLED
+                return CANCELLED
             key = mix64(mix64(seed) + (uint64(scramble) << uint64(32)) + uint64(first + i))
             red = green = blue = 0.0
             for sample in range(samples):
@@ -54,7 +49,7 @@ def _radiance_kernel(t, ray, lines, first, samples, seed, cancelled, out):  # ty
                 green += emitted[1] + direct[1] + indirect[1]
                 blue += emitted[2] + direct[2] + indirect[2]
             out[scramble, i, 0], out[scramble, i, 1], out[scramble, i, 2] = red / samples, green / samples, blue / samples
-    return _DONE
+    return DONE
 
 
 def path_traced_radiance(
@@ -83,24 +78,18 @@ def path_traced_radiance(
     ------
     Cancelled
     """
-    flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
     lines = np.concatenate([rays.origins - tracer.origin, rays.directions], 1)
-    n = len(lines)
-    out = np.zeros((_SCRAMBLES, n, 3))
-
-    def trace_some(first: int) -> int:
-        part = slice(first, first + _CHUNK)
-        into = np.zeros((_SCRAMBLES, len(lines[part]), 3))
-        status: int = _radiance_kernel(tracer.tables, new_rayhit(), lines[part], first, samples, np.uint64(_SEED), flag, into)
-        out[:, part] = into
-        return status
-
-    with ThreadPoolExecutor(threads) as pool:
-        for status in pool.map(trace_some, range(0, n, _CHUNK)):
-            if status == _CANCELLED:
-                raise Cancelled
-            advance(min(_CHUNK, n) / n)
-    return out
+    return estimate(
+        _radiance_kernel,
+        tracer,
+        lines,
+        samples=samples,
+        scrambles=_SCRAMBLES,
+        seed=_SEED,
+        threads=threads,
+        advance=advance,
+        cancelled=cancelled,
+    )
 
 
 def measure_radiance(

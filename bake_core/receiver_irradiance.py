@@ -28,7 +28,8 @@ from bake_core.transport import trace_path
 
 F64 = NDArray[np.float64]
 
-_CANCELLED, _DONE = 1, 0
+# How a kernel of :func:`estimate` ends.
+CANCELLED, DONE = 1, 0
 # Points a thread takes at once: a fraction of a second's work.
 _CHUNK = 32
 
@@ -91,24 +92,61 @@ def irradiance_at(
     stands : (n, 10) float64
         Local frame: point, geometric and shading normal, and how far to leave the surface (0 in the open, where both normals are one).
     """
+    return estimate(
+        _irradiance_kernel,
+        tracer,
+        stands,
+        samples=samples,
+        scrambles=scrambles,
+        seed=seed,
+        threads=threads,
+        advance=advance,
+        cancelled=cancelled,
+    )
+
+
+def estimate(
+    kernel: Callable[..., int],
+    tracer: Tracer,
+    rows: F64,
+    *,
+    samples: int,
+    scrambles: int,
+    seed: int,
+    threads: int = 1,
+    advance: Callable[[float], None] | None = None,
+    cancelled: NDArray[np.uint8] | None = None,
+) -> F64:
+    """(scrambles, n, 3) of what a kernel estimates for each of n rows, some rows at a time on each thread.
+
+    Parameters
+    ----------
+    kernel : callable
+        (tables, ray, some rows, the number of the first of them, samples, seed, flag, out) → whether it was stopped.
+    rows : (n, k) float64
+
+    Raises
+    ------
+    Cancelled
+    """
     flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
-    n = len(stands)
+    n = len(rows)
     out = np.zeros((scrambles, n, 3))
 
     def trace(first: int) -> int:
         part = slice(first, first + _CHUNK)
-        # Rows of their own: a kernel is compiled for each way that an array may lie in memory.
-        into = np.zeros((scrambles, len(stands[part]), 3))
-        status: int = _irradiance_kernel(tracer.tables, new_rayhit(), stands[part], first, samples, np.uint64(seed), flag, into)
+        # An array of its own: a kernel is compiled for each way that one may lie in memory.
+        into = np.zeros((scrambles, len(rows[part]), 3))
+        status = kernel(tracer.tables, new_rayhit(), rows[part], first, samples, np.uint64(seed), flag, into)
         out[:, part] = into
         return status
 
     with ThreadPoolExecutor(threads) as pool:
         for status in pool.map(trace, range(0, n, _CHUNK)):
-            if status == _CANCELLED:
+            if status == CANCELLED:
                 raise Cancelled
             if advance is not None:
-                advance(_CHUNK / n)
+                advance(min(_CHUNK, n) / n)
     return out
 
 
@@ -123,7 +161,7 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
         for scramble in range(out.shape[0]):
             if cancelled[0]:
-                return _CANCELLED
+                return CANCELLED
             key = mix64(mix64(seed) + (uint64(scramble) << uint64(32)) + uint64(first + i))
             red = green = blue = 0.0
             for sample in range(samples):
@@ -156,4 +194,4 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
             # Over the pdf cosθ/π, radiance times cosine is π times radiance.
             scale = math.pi / samples
             out[scramble, i, 0], out[scramble, i, 1], out[scramble, i, 2] = scale * red, scale * green, scale * blue
-    return _DONE
+    return DONE

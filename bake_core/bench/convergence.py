@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,10 +140,6 @@ class Convergence:
 
     def series(self) -> list[Series]:
         return [Series(c.name, [(m.seconds, m.relative_mse**0.5) for m in self.of(c.name)], self.rate(c.name)) for c in self.contestants]
-
-
-class _Renderer(Protocol):
-    def render(self, samples: int, seed: int) -> tuple[Any, float]: ...
 
 
 class _Ours:

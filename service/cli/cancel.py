@@ -3,25 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 
-from service.cli.remote import add_json, add_server, connect
+from service.cli.remote import add_job_command
 
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command."""
-    parser = commands.add_parser("cancel", help="stop a bake")
-    parser.add_argument("id", metavar="ID")
-    add_server(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Cancel; prints the state that follows."""
-    from service.cli.progress import describe_job
-
-    with connect(args.server) as client:
-        job = client.cancel(client.bake(args.id))
-    print(json.dumps(job.document) if args.json else describe_job(job.document))
-    return 0
+    add_job_command(commands, "cancel", "stop a bake", lambda client, bake: client.cancel(bake))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from bake_core.errors import BakeError, InputError, MachineError
 from bake_core.progress import Progress
-from service.cli.progress import ProgressLine
+from service.cli.progress import ProgressLine, describe_job
 
 if TYPE_CHECKING:
     # The client's HTTP library takes longer to load than `octobake --help` should.
@@ -31,6 +32,24 @@ def add_server(parser: argparse.ArgumentParser) -> None:
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add the option for one JSON document on stdout."""
     parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
+
+
+def add_job_command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, words: str, act: Callable[[Client, Bake], Bake]
+) -> None:
+    """Add a command that does one thing to one bake, or nothing, and prints the bake as it then is."""
+    parser = commands.add_parser(name, help=words)
+    parser.add_argument("id", metavar="ID")
+    add_server(parser)
+    add_json(parser)
+
+    def run(args: argparse.Namespace) -> int:
+        with connect(args.server) as client:
+            document = act(client, client.bake(args.id)).document
+        print(json.dumps(document) if args.json else describe_job(document))
+        return 0
+
+    parser.set_defaults(run=run)
 
 
 @contextmanager
