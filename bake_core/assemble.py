@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,9 @@ from bake_core.bundle import CHANNELS, FORMAT, SHADERS, VERSION, Atlas, VolumeDa
 from bake_core.convergence import Verdict
 from bake_core.embree import instruction_set
 from bake_core.errors import BakeError
-from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.gloss_levels import gloss_alphas
 from bake_core.images import write_exr
+from bake_core.parameters import PARAMETERS, Choice, default_choices
 from bake_core.placement import Volume
 from bake_core.selection import LeftOut, Selection
 from bake_core.shader_constants import bundle_constants, probe_texels
@@ -30,20 +31,6 @@ from bake_core.volume_chains import CHAINS, chain_levels, chain_size, traceable,
 
 F32 = NDArray[np.float32]
 
-# A point is moved by (n · normal_bias + wo · view_bias) · bias_scale · spacing before the walls are looked up: the surface bias of Majercik
-# et al. 2021, "Scaling Probe-Based Real-Time Dynamic Global Illumination for Production". Theirs, 0.2, 0.8 and 0.225, was chosen for
-# moments, which blur a wall by more. With no bias towards the viewer, matt light does not change as somebody walks by.
-# `visibility_softness` is over what part of the distance a shadow of the walls fades: none would be a line, and half floats place a wall
-# to 0.0005. Its tail falls as the sixth power, so where no probe sees a point, as in a corner that maps round off, the least hidden one
-# answers. `visibility_floor` is where the tail ends, so that it is above what float32 holds when it has been cubed by the crush.
-PARAMETERS = {
-    "normal_bias": 0.15,
-    "view_bias": 0.0,
-    "bias_scale": 1.0,
-    "visibility_floor": 1e-9,
-    "visibility_softness": 0.01,
-    "visibility_sharpness": float(VISIBILITY_SHARPNESS),
-}
 # Visibility is always stored in full: the variance is a small difference of its two moments, and half floats lose it (DESIGN: half of all
 # flat-wall variances come out negative). Distances are metres of any scale.
 _ALWAYS_FULL = ("visibility", "distance")
@@ -74,6 +61,7 @@ def assemble(
     state: State,
     stopped: Verdict,
     folder: Path,
+    choose: Callable[[Sequence[VolumeData]], list[Choice]] = default_choices,
 ) -> dict[str, Any]:
     """Write atlases and shaders into a folder.
 
@@ -83,6 +71,8 @@ def assemble(
         Of all volumes' probes in turn from their lattice points, metres.
     left_out : tuple of LeftOut
         Outputs and all else.
+    choose : callable
+        What each volume's query uses, by the volumes as they will be read.
 
     Returns
     -------
@@ -94,19 +84,19 @@ def assemble(
     BakeError
         ``bake.not_finite`` where a value is not finite or negative: nothing of the kind is ever written.
     """
-    active = state.active()
-    entries, data, saved = [], [], np.zeros(2, np.int64)
-    first = 0
+    whole = spec.outputs != "auto"
+    packed, first = [], 0
     for index, volume in enumerate(volumes):
         probes = slice(first, first + volume.probe_count)
-        entry, content = _volume(
-            volume, offsets[probes], selection.of(index), selection, state, active, probes, folder, whole=spec.outputs != "auto"
-        )
-        entries.append(entry)
+        packed.append(_pack(volume, offsets[probes], selection.of(index), selection, state, probes, whole=whole))
+        first += volume.probe_count
+    entries, data, saved = [], [], np.zeros(2, np.int64)
+    for (content, described), choice in zip(packed, choose([p.content for p in packed]), strict=True):
+        content = replace(content, parameters=choice.parameters)
+        entries.append(_write(content, described, choice, folder))
         data.append(content)
         size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
         saved += np.array([(content.states == left_out_as).sum() * size for left_out_as in (0, 2)])
-        first += volume.probe_count
     shaders = folder / "shaders"
     shaders.mkdir()
     for name in (*SHADERS, "README.md"):
@@ -186,20 +176,26 @@ def _error(spec: Spec, volumes: tuple[Volume, ...], selection: Selection, state:
     }
 
 
-def _volume(
+class _Packed(NamedTuple):
+    """A volume as it will be read, with default parameters; and of each atlas what the manifest says."""
+
+    content: VolumeData
+    described: list[dict[str, Any]]
+
+
+def _pack(
     volume: Volume,
     offsets: F32,
     outputs: tuple[OutputName, ...],
     selection: Selection,
     state: State,
-    active: NDArray[np.bool_],
     probes: slice,
-    folder: Path,
     *,
     whole: bool,
-) -> tuple[dict[str, Any], VolumeData]:
-    """One volume's files, its entry in the manifest, and what its shaders need to know; `whole` maps have a file and all channels."""
-    kept = np.flatnonzero(active[probes])
+) -> _Packed:
+    """Choose encodings and lay out atlases; `whole` maps have a file and all channels."""
+    active = state.active()[probes]
+    kept = np.flatnonzero(active)
     maps: dict[str, F32] = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
     if "visibility" in maps:
         maps["visibility"], maps["walls"] = maps["visibility"][..., :2], maps["visibility"][..., 2:]
@@ -231,50 +227,56 @@ def _volume(
             entry |= {"file": None, "constant": [float(str(x)) for x in stored]}
         elif not whole and entry["channels"] == ["R", "G", "B"] and (interior == interior[..., :1]).all():
             entry["channels"] = ["Y"] * 3
-        if entry["file"] is not None:
-            _write_layers(folder / entry["file"], atlas.texels, tuple(dict.fromkeys(entry["channels"])), half=encoding == "half")
         if output == "distance":
             entry["miss"] = selection.miss_distance
             atlas = replace(atlas, miss=selection.miss_distance)
         atlases[output] = atlas
         described.append(entry)
-    states = np.where(active[probes], 1, np.where(state.needed[probes], 0, 2)).astype(np.uint8)
     content = VolumeData(
         name=volume.name,
         origin=volume.origin,
         spacing=volume.spacing,
         counts=np.asarray(volume.counts, np.int64),
-        states=states,
+        states=np.where(active, 1, np.where(state.needed[probes], 0, 2)).astype(np.uint8),
         offsets=offsets,
         backface=state.backface[probes],
         parameters=PARAMETERS,
         distance_limit=volume.distance_limit,
         atlases=atlases,
     )
-    table = probe_texels(content)
+    return _Packed(content, described)
+
+
+def _write(volume: VolumeData, described: list[dict[str, Any]], choice: Choice, folder: Path) -> dict[str, Any]:
+    """A volume's files, and its entry in the manifest."""
+    for entry in described:
+        if entry["file"] is not None:
+            texels = volume.atlases[entry["output"]].texels
+            _write_layers(folder / entry["file"], texels, tuple(dict.fromkeys(entry["channels"])), half=entry["encoding"] == "half")
     probe_file = f"{volume.name}.probes.exr"
-    _write_layers(folder / probe_file, table, CHANNELS["probes"], half=False)
-    entry = {
+    _write_layers(folder / probe_file, probe_texels(volume), CHANNELS["probes"], half=False)
+    shape = next(iter(volume.atlases.values()))
+    return {
         "name": volume.name,
         "origin": volume.origin.tolist(),
         "spacing": volume.spacing.tolist(),
-        "counts": list(volume.counts),
+        "counts": volume.counts.tolist(),
         "distance_limit": volume.distance_limit,
-        "parameters": PARAMETERS,
+        "parameters": dict(volume.parameters),
+        "chosen": choice.entry(),
         "layout": {"columns": shape.columns, "rows": shape.rows, "layers": shape.layers},
         "probes": {
             "file": probe_file,
-            "count": volume.probe_count,
-            "active": len(kept),
-            "states": states.tolist(),
-            "offsets": [[float(str(x)) for x in offset] for offset in offsets] if offsets.any() else None,
+            "count": len(volume.states),
+            "active": int((volume.states == 1).sum()),
+            "states": volume.states.tolist(),
+            "offsets": [[float(str(x)) for x in offset] for offset in volume.offsets] if volume.offsets.any() else None,
             # Shortest decimals of the float32 values.
-            "backface": [float(str(b)) for b in state.backface[probes]],
+            "backface": [float(str(b)) for b in volume.backface],
         },
         "atlases": described,
-        "chains": [_chain(content, chain, folder) for chain in CHAINS] if traceable([content]) else [],
+        "chains": [_chain(volume, chain, folder) for chain in CHAINS] if traceable([volume]) else [],
     }
-    return entry, content
 
 
 def _chain(volume: VolumeData, chain: str, folder: Path) -> dict[str, Any]:

@@ -451,12 +451,9 @@ def _seed(spec: Spec, what: str, *numbers: int) -> int:
     return int(np.random.SeedSequence([_SEED, spec.seed, *what.encode(), *numbers]).generate_state(1, np.uint64)[0])
 
 
-def compile_audit(scene: Scene, tracer: Tracer) -> None:
-    """Compile, or fetch from the cache on disk, the kernels of an audit: by auditing nothing at all."""
+def compile_audit(tracer: Tracer) -> None:
+    """Compile, or fetch from the cache on disk, the kernels of an audit, but for those of :func:`bake_core.parameters.compile_choice`."""
     nothing = np.zeros((0, 3))
     one = np.zeros((1, 3))
     sphere_irradiance(tracer, one, one, 0, 0, threads=1, cancelled=np.zeros(1, np.uint8))
-    irradiance_at(tracer, np.zeros((1, 10)), samples=0, scrambles=1, seed=0)
     lobe_moments(tracer, nothing, nothing, np.zeros(0), 0, 0, np.zeros(1, np.uint8))
-    receivers = draw_receivers(scene, tracer, (), 0, 0, boxes=scene.bounds)
-    stands_of(tracer, receivers.places)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
-from bake_core.assemble import PARAMETERS, assemble
+from bake_core.assemble import assemble
 from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
 from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
@@ -33,6 +33,7 @@ from bake_core.endless import check_light_ends
 from bake_core.environment import Find, no_images, read_environment
 from bake_core.errors import Cancelled, MachineError
 from bake_core.octahedral import texel_solid_angles
+from bake_core.parameters import LARGEST, choose_parameters, compile_choice
 from bake_core.placement import Volume, place
 from bake_core.progress import ProgressCallback
 from bake_core.reach import probes_about_surfaces
@@ -138,7 +139,7 @@ def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:
     Surfaces are taken as far off as a query moves its point before it asks for visibility, which bounds what a renderer does to points.
     """
     counts = [np.asarray(v.counts, np.int64) for v in volumes]
-    margins = [sum(biases(PARAMETERS, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
+    margins = [sum(biases(LARGEST, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
     return np.concatenate([probes_about_surfaces(scene, v, margin) for v, margin in zip(volumes, margins, strict=True)])
 
 
@@ -264,8 +265,9 @@ def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
 def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
+    compile_choice(prepared.scene, prepared.whole)
     if audited:
-        compile_audit(prepared.scene, prepared.whole)
+        compile_audit(prepared.whole)
 
 
 def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> None:
@@ -409,6 +411,7 @@ def finish(
                 state,
                 run.stopped,
                 work,
+                lambda volumes: choose_parameters(prepared.scene, prepared.whole, volumes, threads=run.threads),
             )
             written = bundle.dump_json(manifest)
             (work / bundle.MANIFEST).write_bytes(written)

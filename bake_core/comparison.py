@@ -9,11 +9,11 @@ import flip_evaluator
 import numpy as np
 from numpy.typing import NDArray
 
+from bake_core.relmse import RELMSE_FLOOR
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# Below a tenth of the picture's mean, error counts as absolute: else relMSE would be decided by the darkest corner.
-RELMSE_FLOOR = 0.1
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 

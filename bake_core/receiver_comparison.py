@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.comparison import RELMSE_FLOOR
 from bake_core.irradiance import sample
 from bake_core.receiver_irradiance import path_traced_irradiance
 from bake_core.receivers import Receivers, draw_receivers
+from bake_core.relmse import RELMSE_FLOOR, relative_squares
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
 
@@ -68,8 +68,7 @@ def compare_receivers(answers: F64, estimates: F64) -> ReceiverFigures:
     Notes
     -----
     With a the answer, b the mean of the estimates, |·| over channels and m the mean of |b| over receivers, the relative error of a
-    receiver is |a - b| / √(|b|² + (m/10)²). relMSE is the mean of its square, as mean of (a - bᵢ)·(a - bⱼ) / (|b'|² + (m/10)²) over all
-    pairs, b' being the mean of the estimates that are not in the pair: noise of neither factor is in the other, nor in the divisor.
+    receiver is |a - b| / √(|b|² + (m/10)²). relMSE is the mean of its square, by :func:`bake_core.relmse.relative_squares`.
     """
     k, n = estimates.shape[:2]
     if k < 4:
@@ -83,11 +82,10 @@ def compare_receivers(answers: F64, estimates: F64) -> ReceiverFigures:
         return ReceiverFigures(mean, 0.0, 1.0 if same else None, 0.0 if same else None, 0.0 if same else None, 0.0, 0.0)
     size = np.linalg.norm(reference, axis=1)
     floor = (RELMSE_FLOOR * size.mean()) ** 2
-    relmse, noise = [], []
+    noise = []
     for i, j in itertools.combinations(range(k), 2):
         others = estimates[[o for o in range(k) if o not in (i, j)]].mean(0)
         weight = 1 / ((others**2).sum(1) + floor)
-        relmse.append((((answers - estimates[i]) * (answers - estimates[j])).sum(1) * weight).mean())
         noise.append((((estimates[i] - estimates[j]) ** 2).sum(1) * weight).mean() / (2 * k))
     scale = np.sqrt(size**2 + floor)
     error = np.linalg.norm(answers - reference, axis=1) / scale
@@ -97,7 +95,7 @@ def compare_receivers(answers: F64, estimates: F64) -> ReceiverFigures:
         mean,
         reference_mean,
         mean / reference_mean,
-        float(np.mean(relmse)),
+        float(relative_squares(answers, estimates).mean()),
         float(np.percentile(error, _PERCENTILE)),
         float(np.mean(noise)),
         float(np.percentile(np.linalg.norm(halves, axis=1) / scale, _PERCENTILE)),

@@ -151,6 +151,14 @@ def audit_of(report: dict[str, Any]) -> Audit | None:
     return Audit(**{**told, "texels": texels, "surfaces": None if told["surfaces"] is None else Figures(**told["surfaces"])})
 
 
+def chosen_in_words(parameters: dict[str, float], chosen: dict[str, Any]) -> str:
+    """What a manifest says of a volume's query: its parameters, and what they were chosen by."""
+    bias, floor, fade = (parameters[k] for k in ("normal_bias", "visibility_floor", "visibility_softness"))
+    here, default = (percent(max(chosen[k], 0.0) ** 0.5) for k in ("error", "default_error"))
+    measured = f"error {here} at {chosen['points']} points on surfaces"
+    return f"bias {bias:g}, floor {floor:g}, fade {fade:g}: {measured}" + ("" if here == default else f", {default} by default")
+
+
 def audit_in_words(audit: Audit) -> str:
     """One line: what was looked at, and what came of it."""
     said = []

@@ -1,0 +1,66 @@
+"""The bake-time choice of what a query's weights depend on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bake_core.bake import prepare
+from bake_core.bundle import MANIFEST, VolumeData
+from bake_core.examples import Example, closed_box, cornell, two_rooms
+from bake_core.irradiance import sample
+from bake_core.leaks import leak_ratio
+from bake_core.parameters import BIASES, FADES, FLOORS, PARAMETERS, Choice, choose_parameters
+from bake_core.scene_files import load_scene
+from bake_core.spec import parse_spec
+from tests.baking import THREADS, bake_example
+
+STOP = {"target_error": None, "max_samples": 16}
+
+
+def volume_of(folder: Path, example: Example) -> VolumeData:
+    return bake_example(folder, example, stop=STOP).volumes[0]
+
+
+def choice_for(folder: Path, example: Example, volume: VolumeData, threads: int = THREADS) -> Choice:
+    scene = load_scene(folder / "scene.glb")
+    return choose_parameters(scene, prepare(scene, parse_spec(example[1])).whole, [volume], threads=threads)[0]
+
+
+def test_walls_between_rooms_keep_the_default_and_their_darkness(tmp_path: Path) -> None:
+    volume = volume_of(tmp_path, two_rooms())
+    assert volume.parameters == PARAMETERS
+    entry = json.loads((tmp_path / "bundle" / MANIFEST).read_bytes())["volumes"][0]["chosen"]
+    assert entry["points"] == 2048
+    assert entry["error"] == entry["default_error"] < 0.02
+    assert leak_ratio(lambda p, n: sample([volume], p, n).irradiance) < 0.002
+
+
+def test_walls_that_hide_what_is_seen_are_given_less_weight(tmp_path: Path) -> None:
+    """Maps too coarse for their scene, in the extreme: of two probes in three the walls are said to be nearer than they are."""
+    example = cornell()
+    baked = volume_of(tmp_path, example)
+    walls = baked.atlases["walls"]
+    tiles = np.arange(walls.rows * walls.columns).reshape(1, walls.rows, walls.columns)
+    nearer = np.where(tiles % 3 == 0, 1, 8).repeat(walls.tile, 1).repeat(walls.tile, 2)[..., None]
+    lies = replace(baked, atlases={**baked.atlases, "walls": replace(walls, texels=(walls.texels * nearer).astype(np.float32))})
+    choice = choice_for(tmp_path, example, lies)
+    assert choice.error is not None
+    assert choice.default_error is not None
+    assert choice.error < 0.99 * choice.default_error
+    assert choice.parameters != PARAMETERS
+    assert choice.parameters["normal_bias"] in BIASES
+    assert choice.parameters["visibility_floor"] in FLOORS
+    assert choice.parameters["visibility_softness"] in FADES
+    assert choice == choice_for(tmp_path, example, lies, threads=1)
+
+
+@pytest.mark.parametrize("outputs", [["irradiance"], ["visibility"]])
+def test_without_walls_or_light_nothing_is_measured(outputs: list[str], tmp_path: Path) -> None:
+    volume = bake_example(tmp_path, closed_box(0.5, 1.0), stop=STOP, outputs=outputs).volumes[0]
+    assert volume.parameters == PARAMETERS
+    assert json.loads((tmp_path / "bundle" / MANIFEST).read_bytes())["volumes"][0]["chosen"] is None
