@@ -1,7 +1,7 @@
 """The whole bake on one screen: scene and spec in, passes of samples over shards of probes, a bundle out.
 
-1. :func:`prepare`: place the probes, build what rays need.
-2. :func:`trace_shard`: one shard's part of one pass; any process may do it, in any order.
+1. :func:`bake_core.prepared.prepare`: place the probes, build what rays need.
+2. :func:`bake_core.shards.trace_shard`: one shard's part of one pass; any process may do it, in any order.
 3. :class:`bake_core.tally.State`: add a pass, measure the error; :func:`bake_core.convergence.decide` whether another follows
    (:func:`gather` does both, pass after pass).
 4. :func:`finish`: filter, pack, encode, write.
@@ -12,10 +12,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,128 +24,19 @@ from bake_core import bundle, report
 from bake_core.allocation import HALVES, SCRAMBLES, Allocation
 from bake_core.assemble import assemble
 from bake_core.audit import DEFAULT_SHARE, Audit, Baked, audit, compile_audit
-from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.clock import Clock
 from bake_core.convergence import Point, decide, fit_pass, next_pass
 from bake_core.endless import check_light_ends
-from bake_core.environment import Find, no_images, read_environment
+from bake_core.environment import Find, no_images
 from bake_core.errors import Cancelled, MachineError
-from bake_core.octahedral import texel_solid_angles
-from bake_core.parameters import LARGEST, choose_parameters, compile_choice
-from bake_core.placement import Volume, place
+from bake_core.parameters import choose_parameters, compile_choice
+from bake_core.prepared import Prepared, prepare
 from bake_core.progress import ProgressCallback
-from bake_core.reach import probes_about_surfaces
-from bake_core.relocation import relocate
 from bake_core.report import Run
-from bake_core.scene import Scene
 from bake_core.scene_files import load_scene
-from bake_core.sealed import is_sealed
-from bake_core.selection import LeftOut, Selection, select
-from bake_core.shader_constants import biases
+from bake_core.shards import shard_ranges, trace_shard
 from bake_core.spec import Spec
-from bake_core.tally import State, Tally, outside
-from bake_core.tracer import Tracer
-from bake_core.unneeded import unneeded
-from bake_core.walls import moments_and_walls
-
-# Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
-_DISTANCE_CHUNK = 64
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A function of scene and spec only.
-
-    Attributes
-    ----------
-    positions : (n, 3) float64
-        Of all probes of all volumes in turn, local frame.
-    offsets : (n, 3) float32
-        By how much they were moved from their lattice points.
-    limits, units : (n,) float64
-        Each probe's distance limit, and the smallest spacing of its volume, metres.
-    needed : (n,) bool
-        Which of them are baked at all, unless they turn out to stand inside a solid.
-    tracer : Tracer
-        What probes are traced with.
-    whole : Tracer
-        The scene as it is: what audits look at. It has an environment that `tracer` may do without.
-    """
-
-    scene: Scene
-    spec: Spec
-    volumes: tuple[Volume, ...]
-    selection: Selection
-    tracer: Tracer
-    whole: Tracer
-    positions: NDArray[np.float64]
-    offsets: NDArray[np.float32]
-    limits: NDArray[np.float64]
-    units: NDArray[np.float64]
-    needed: NDArray[np.bool_]
-
-    @property
-    def probe_count(self) -> int:
-        return len(self.positions)
-
-    @property
-    def left_out(self) -> tuple[LeftOut, ...]:
-        """Outputs first, then what kernels do without."""
-        return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
-
-
-def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
-    """Place the probes, choose the outputs, build the acceleration structure.
-
-    Parameters
-    ----------
-    find : callable, optional
-        Where an image that the spec names lies; in what is prepared it is named by its digest.
-
-    Raises
-    ------
-    SpecError, SceneError
-    """
-    volumes = place(scene, spec)
-    environment, named = read_environment(spec.environment, find)
-    spec = spec.model_copy(update={"environment": named})
-    positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
-    whole = Tracer.build(scene, spec, environment)
-    offsets = np.zeros(positions.shape, np.float32)
-    if spec.probes == "relocated":
-        offsets = relocate(whole, volumes, positions)
-        positions = positions + offsets
-    shines = environment.sky is not None or bool(environment.constant.any())
-    return Prepared(
-        scene=scene,
-        spec=spec,
-        volumes=volumes,
-        selection=select(scene, spec, volumes),
-        tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
-        whole=whole,
-        positions=positions,
-        offsets=offsets,
-        limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
-        units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
-        needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
-    )
-
-
-def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:
-    """Which probes any query on a surface asks, (n,) bool, of all volumes in turn: :func:`bake_core.reach.probes_about_surfaces`.
-
-    Surfaces are taken as far off as a query moves its point before it asks for visibility, which bounds what a renderer does to points.
-    """
-    counts = [np.asarray(v.counts, np.int64) for v in volumes]
-    margins = [sum(biases(LARGEST, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
-    return np.concatenate([probes_about_surfaces(scene, v, margin) for v, margin in zip(volumes, margins, strict=True)])
-
-
-def shard_ranges(probe_count: int, shards: int) -> list[tuple[int, int]]:
-    """Half-open ranges of probes, as equal as they go; never an empty one."""
-    shards = max(1, min(shards, probe_count))
-    edges = [probe_count * i // shards for i in range(shards + 1)]
-    return list(pairwise(edges))
+from bake_core.tally import State
 
 
 def empty_state(prepared: Prepared) -> State:
@@ -180,88 +69,6 @@ def empty_state(prepared: Prepared) -> State:
         ) from None
 
 
-def trace_shard(
-    prepared: Prepared,
-    probes: tuple[int, int],
-    samples: tuple[int, int],
-    allocation: Allocation,
-    *,
-    threads: int,
-    cancelled: NDArray[np.uint8] | None = None,
-    advance: Callable[[float], None] = lambda fraction: None,
-) -> Tally:
-    """One shard's part of one pass.
-
-    Parameters
-    ----------
-    probes, samples : (int, int)
-        Half-open ranges. The pass that starts at sample 0 captures distances first: who stands inside a solid is not traced.
-    allocation : Allocation
-        What each probe of the bake has had before this pass, and what part of it each gets.
-    cancelled : (1,) uint8, optional
-        Set it to 1 from any thread: the kernels stop within one texel.
-    advance : callable
-        Told the fraction of this shard done since it was last called; from any thread.
-
-    Raises
-    ------
-    Cancelled
-    """
-    s = prepared.selection
-    flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
-    positions = np.ascontiguousarray(prepared.positions[slice(*probes)])
-    ids = np.arange(*probes, dtype=np.uint64)
-    capture = Capture(s.capture, s.irradiance, prepared.spec.seed, s.keeps("radiance"))
-    spans = allocation.spans(samples, slice(*probes))
-    seen: dict[str, NDArray[np.float32]] = {}
-    looked = 0
-    if samples[0] == 0:
-        needed = prepared.needed[slice(*probes)]
-        seen, looked = _see(prepared, probes[0] + np.flatnonzero(needed), threads, flag)
-        free = outside(seen["backface"])
-        seen = {name: values if name == "backface" else values[free] for name, values in seen.items()}
-        seen["backface"], kept = _spread(seen["backface"], needed), _spread(free, needed)
-        spans[~kept, :, 1] = spans[~kept, :, 0]
-    else:
-        kept = allocation.eighths[slice(*probes)].max(1) > 0
-    irradiance, radiance, rays = capture_radiance(
-        prepared.tracer,
-        np.ascontiguousarray(positions[kept]),
-        ids[kept],
-        np.ascontiguousarray(spans[kept]),
-        capture,
-        threads=threads,
-        cancelled=flag,
-        advance=advance,
-    )
-    empty = np.zeros
-    return Tally(
-        *probes,
-        *samples,
-        taken=spans[..., 1],
-        irradiance=_stored(irradiance),
-        radiance=_stored(radiance),
-        visibility=seen.get("visibility", empty((0, 0, 0, 0), np.float32)),
-        backface=seen.get("backface", empty(0, np.float32)),
-        distance=seen.get("distance", empty((0, 0), np.float32)),
-        normal=seen.get("normal", empty((0, 0, 0), np.float32)),
-        rays=rays + looked,
-    )
-
-
-def _spread(values: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
-    """Values of those where a mask says so; zeros for the others."""
-    out = np.zeros(len(where), values.dtype)
-    out[where] = values
-    return out
-
-
-def _stored(sums: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Sums in single precision: 2⁻²⁴ of a value is far below what its samples know. What overflows is refused where maps are checked."""
-    with np.errstate(over="ignore"):
-        return sums.astype(np.float32)
-
-
 def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
@@ -282,35 +89,6 @@ def check_finite(prepared: Prepared, *, threads: int, cancelled: NDArray[np.uint
     if prepared.spec.max_bounces is None:
         flag = np.zeros(1, np.uint8) if cancelled is None else cancelled
         check_light_ends(prepared.scene, prepared.tracer, prepared.positions, threads=threads, cancelled=flag)
-
-
-def _see(
-    prepared: Prepared, probes: NDArray[np.int64], threads: int, flag: NDArray[np.uint8]
-) -> tuple[dict[str, NDArray[np.float32]], int]:
-    """Distances and what is made of them, a few probes at a time on each thread; and how many rays they took."""
-    s = prepared.selection
-    positions, limits, units = (np.ascontiguousarray(a[probes]) for a in (prepared.positions, prepared.limits, prepared.units))
-    solid_angle = texel_solid_angles(s.distance).reshape(-1) / (4 * np.pi)
-
-    def look(first: int) -> tuple[dict[str, NDArray[np.float32]], int]:
-        chunk = slice(first, first + _DISTANCE_CHUNK)
-        distance, normal, back, rays = capture_distance(prepared.tracer, positions[chunk], s.distance, cancelled=flag)
-        # One row at a time: a matrix product's bits may depend on how many rows it has.
-        seen = {"backface": np.array([solid_angle[row].sum() for row in back], np.float32)}
-        if s.keeps("visibility"):
-            seen["visibility"] = moments_and_walls(distance, limits[chunk], units[chunk], s.visibility)
-        if s.keeps("distance"):
-            seen["distance"] = np.where(np.isfinite(distance), distance, s.miss_distance).astype(np.float32)
-        if s.keeps("normal"):
-            if s.normal != s.distance:
-                _, normal, _, more = capture_distance(prepared.tracer, positions[chunk], s.normal, cancelled=flag)
-                rays += more
-            seen["normal"] = normal
-        return seen, rays
-
-    with ThreadPoolExecutor(threads) as pool:
-        parts, counts = zip(*pool.map(look, range(0, max(len(positions), 1), _DISTANCE_CHUNK)), strict=True)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, sum(counts)
 
 
 def gather(

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.atlas import Layout, unpack
-from bake_core.bake import Prepared, check_finite, compile_kernels, finish, gather, prepare
+from bake_core.bake import check_finite, compile_kernels, finish, gather
 from bake_core.bundle import VolumeData, read_bundle
 from bake_core.clock import Clock
 from bake_core.environment import Find, no_images
+from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.spec import OUTPUTS, Spec

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.allocation import PILOT_SAMPLES, SCRAMBLES, Allocation
-from bake_core.bake import Prepared, check_finite, compile_kernels, empty_state, needed_probes, prepare, trace_shard
+from bake_core.bake import check_finite, compile_kernels, empty_state
 from bake_core.convergence import decide, error_bound, f95, next_pass
 from bake_core.environment import Find, no_images
+from bake_core.prepared import Prepared, needed_probes, prepare
 from bake_core.scene import Scene
 from bake_core.selection import LeftOut
+from bake_core.shards import trace_shard
 from bake_core.spec import Spec, Stop
 from bake_core.tally import Tally
 

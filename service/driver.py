@@ -24,6 +24,7 @@ from bake_core.convergence import decide, fit_pass, next_pass
 from bake_core.errors import BakeError, OctobakeError
 from bake_core.progress import Progress
 from bake_core.report import Run
+from bake_core.shards import shard_ranges
 from bake_core.spec import Spec, parse_spec
 from service import worker
 from service.blobs import Blobs, StoreError
@@ -223,7 +224,7 @@ class Driver:
         """Trace what is missing of a pass, and merge it."""
         state, allocation = (before.state, before.allocation) if before else (None, None)
         tallies = {i: s.tally for i, s in self._store.shards(self.job.id, opened.index).items()}
-        ranges = bake.shard_ranges(probes, opened.shards)
+        ranges = shard_ranges(probes, opened.shards)
 
         def piece(shard: int) -> _Piece:
             def commit(result: tuple[str, float]) -> None:

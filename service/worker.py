@@ -29,9 +29,12 @@ from bake_core.bundle import read_bundle
 from bake_core.cameras import parse_cameras
 from bake_core.errors import BakeError
 from bake_core.images import write_png
+from bake_core.prepared import Prepared
+from bake_core.prepared import prepare as prepare_bake
 from bake_core.preview import preview
 from bake_core.progress import Progress
 from bake_core.report import Run
+from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
@@ -114,7 +117,7 @@ def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, in
         blobs = _blobs(work.store)
         given = Allocation.from_bytes(blobs.get_work(work.job, allocation)) if allocation else Allocation.start(prepared.probe_count)
         began = time.monotonic()
-        tally = bake.trace_shard(prepared, probes, samples, given, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
+        tally = trace_shard(prepared, probes, samples, given, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
         seconds = time.monotonic() - began
         return blobs.put_work(work.job, name, tally.to_bytes()), seconds
 
@@ -298,7 +301,7 @@ def _preview(sums: State, folder: str) -> Path:
 
 
 # A worker has one task slot, so one thread at a time works on these; the lock is for whoever runs a worker with more.
-_cache: OrderedDict[str, bake.Prepared] = OrderedDict()
+_cache: OrderedDict[str, Prepared] = OrderedDict()
 _stores: dict[str, Blobs] = {}
 _lock = threading.Lock()
 
@@ -310,7 +313,7 @@ def _blobs(url: str) -> Blobs:
         return _stores[url]
 
 
-def _prepared(work: Work) -> bake.Prepared:
+def _prepared(work: Work) -> Prepared:
     key = repr((work.scene, work.spec))
     stored = _blobs(work.store)
     with _lock:
@@ -320,7 +323,7 @@ def _prepared(work: Work) -> bake.Prepared:
             # A job with a limit is not charged for the scenes of others.
             while len(_cache) >= (work.cached_scenes if work.memory_bytes is None else 1):
                 _cache.popitem(last=False)
-            _cache[key] = bake.prepare(scene, parse_spec(work.spec), find_stored(stored))
+            _cache[key] = prepare_bake(scene, parse_spec(work.spec), find_stored(stored))
         _cache.move_to_end(key)
         return _cache[key]
 

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.atlas import Layout, unpack
-from bake_core.bake import bake, prepare
+from bake_core.bake import bake
 from bake_core.bench.outcome import Series
 from bake_core.bench.peers import Peer, cannot_render, find_peers, running, work
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.environment import Find
 from bake_core.errors import BakeError, InputError
+from bake_core.prepared import prepare
 from bake_core.rate import Rate, in_words, rate_of_runs
 from bake_core.scene_files import load_scene
 from bake_core.spec import SMALLEST_RESOLUTION, Spec, parse_spec

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.bake import Prepared
 from bake_core.errors import BakeError
+from bake_core.prepared import Prepared
 from bake_core.scene import ALPHA_OPAQUE, LIGHT_DIRECTIONAL, Scene
 
 F32 = NDArray[np.float32]

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.bake import Prepared, compile_kernels, gather, prepare
+from bake_core.bake import compile_kernels, gather
 from bake_core.clock import Clock
 from bake_core.convergence import DARK_FRACTION
 from bake_core.environment import beside
 from bake_core.examples import cornell, two_rooms
+from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene_files import load_scene
 from bake_core.spec import Stop, parse_spec

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bake_core.bake import Prepared
+from bake_core.prepared import Prepared
 from tests.closed_form.coverage_table import SCENES, coverage
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.bake import Prepared, check_finite, finish, gather, prepare
+from bake_core.bake import check_finite, finish, gather
 from bake_core.both_ways import everything
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.clock import Clock
@@ -24,6 +24,7 @@ from bake_core.errors import InputError
 from bake_core.examples import box_sides, quads_part
 from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.images import read_exr, write_exr
+from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene import Camera, Scene
 from bake_core.spec import parse_spec

@@ -20,14 +20,8 @@ from tests.reference.gallery import OWN, PAGE, SCENES
 SAMPLES = {"rtxgi_two_rooms": 16, "godot_zdm2": 64}
 
 
-# Since walls tell leaks from light, two miss limits that moments kept: the limits stand, the misses are named.
-MISSES = {
-    "atrium": pytest.mark.xfail(reason="indirect light of the gallery is 8.4 % too bright, at most 7 % is allowed"),
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=MISSES.get(name, ())) for name in SCENES])
+@pytest.mark.parametrize("name", SCENES)
 def test_a_shared_scene_keeps_its_limits(shared: Path, name: str, tmp_path: Path) -> None:
     scene = shared / "scenes" / f"{name}.glb"
     spec = load_spec(shared / "specs" / f"{name}.json").canonical()

@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core.allocation import uniform
-from bake_core.bake import prepare
 from bake_core.capture import Capture, capture_radiance
 from bake_core.gltf.reader import load_scene
+from bake_core.prepared import prepare
 from bake_core.spec import parse_spec
 from tests.baking import THREADS
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.bake import prepare
 from bake_core.environment import beside
 from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import look_at
 from bake_core.images import write_exr
 from bake_core.picture import path_trace_picture
+from bake_core.prepared import prepare
 from bake_core.scene import Camera
 from bake_core.spec import parse_spec
 from tests.baking import THREADS

@@ -23,11 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core import published_weights
-from bake_core.bake import bake, prepare
+from bake_core.bake import bake
 from bake_core.bundle import VolumeData, read_bundle
 from bake_core.examples import Example, cornell, tunnel, two_rooms
 from bake_core.irradiance import sample
 from bake_core.leaks import leak_ratio
+from bake_core.prepared import prepare
 from bake_core.receiver_comparison import ReceiverFigures, compare_receivers, measure_receivers
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.allocation import PILOT_SAMPLES, Allocation
-from bake_core.bake import empty_state, prepare, trace_shard
+from bake_core.bake import empty_state
 from bake_core.environment import beside
 from bake_core.octahedral import dir_to_oct, with_border
+from bake_core.prepared import prepare
 from bake_core.scene_files import load_scene
+from bake_core.shards import trace_shard
 from bake_core.spec import load_spec
 from bake_core.tally import State
 

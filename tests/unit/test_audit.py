@@ -12,11 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core.audit import Audit, Baked, audit
-from bake_core.bake import Prepared, finish, gather, prepare
+from bake_core.bake import finish, gather
 from bake_core.bundle import Atlas, VolumeData, read_bundle, read_report
 from bake_core.clock import Clock
 from bake_core.errors import Cancelled
 from bake_core.examples import closed_box, cornell, square_emitter, two_rooms
+from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bake_core import tally
 from bake_core.allocation import Allocation
-from bake_core.bake import BakeResult, bake, empty_state, finish, gather, prepare, shard_ranges, trace_shard
+from bake_core.bake import BakeResult, bake, empty_state, finish, gather
 from bake_core.bundle import read_bundle, read_report
 from bake_core.clock import Clock
 from bake_core.convergence import Point, Verdict, decide, next_pass
@@ -26,8 +26,10 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
 from bake_core.irradiance import sample
 from bake_core.octahedral import oct_to_dir, texel_directions, with_border
+from bake_core.prepared import prepare
 from bake_core.progress import Progress
 from bake_core.report import Run
+from bake_core.shards import shard_ranges, trace_shard
 from bake_core.spec import Stop, parse_spec
 from bake_core.tally import State, Tally
 from tests.baking import maps

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bake_core.bake import prepare
 from bake_core.bench import pairs, peers
 from bake_core.bench.convergence import EPSILON
 from bake_core.bench.outcome import Series, error_against_seconds, put_section
 from bake_core.bench.targets import audited_in_words
 from bake_core.drawing import as_svg
 from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
+from bake_core.prepared import prepare
 from bake_core.rate import rate_of_runs
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bake_core.bake import Prepared, check_finite, prepare
+from bake_core.bake import check_finite
 from bake_core.errors import Cancelled, SceneError
 from bake_core.examples import closed_box, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.plan import plan
+from bake_core.prepared import Prepared, prepare
 from bake_core.spec import parse_spec
 from bake_core.stability.scenes import box, box_with_hole
 from tests.scenes import load, sky

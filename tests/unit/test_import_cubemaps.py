@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bake_core.bake import prepare
 from bake_core.bundle import read_bundle
 from bake_core.capture import _distance_kernel
 from bake_core.cubemaps import FACES, FRAMES, cube_directions, octahedral_radiance, octahedral_surfaces
@@ -16,6 +15,7 @@ from bake_core.embree import new_rayhit
 from bake_core.examples import glossy_cornell
 from bake_core.images import write_exr
 from bake_core.octahedral import oct_to_dir, texel_directions
+from bake_core.prepared import prepare
 from bake_core.ray_radiance import path_traced_radiance
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bake_core.bake import prepare
 from bake_core.bundle import MANIFEST, VolumeData
 from bake_core.examples import Example, closed_box, cornell, two_rooms
 from bake_core.irradiance import sample
 from bake_core.leaks import leak_ratio
 from bake_core.parameters import BIASES, FADES, FLOORS, PARAMETERS, Choice, choose_parameters
+from bake_core.prepared import prepare
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec
 from tests.baking import THREADS, bake_example

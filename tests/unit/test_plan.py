@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from bake_core.allocation import FULL, HALVES, PILOT_SAMPLES, Allocation
-from bake_core.bake import bake, empty_state, prepare
+from bake_core.bake import bake, empty_state
 from bake_core.both_ways import measure
 from bake_core.clock import expected_samples
 from bake_core.convergence import error_bound
@@ -23,6 +23,7 @@ from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.images import read_exr
 from bake_core.placement import place
 from bake_core.plan import Pilot, doubt, plan, samples_needed
+from bake_core.prepared import prepare
 from bake_core.scene import Scene
 from bake_core.selection import Selection, select
 from bake_core.spec import OUTPUTS, Stop, parse_spec

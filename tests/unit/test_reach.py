@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.bake import prepare
 from bake_core.examples import plane_under_sun
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.irradiance import cell, sample
 from bake_core.placement import Volume
 from bake_core.plan import plan
+from bake_core.prepared import prepare
 from bake_core.reach import probes_about_surfaces, triangles_meeting
 from bake_core.scene import Scene
 from bake_core.spec import parse_spec

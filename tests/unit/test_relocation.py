@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bake_core.bake import prepare
 from bake_core.examples import box_sides, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
+from bake_core.prepared import prepare
 from bake_core.relocation import FARTHEST
 from bake_core.spec import parse_spec
 from tests.baking import bake_example

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core import sealed
-from bake_core.bake import prepare
 from bake_core.examples import box_sides, quads_part
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.images import write_exr
+from bake_core.prepared import prepare
 from bake_core.sealed import is_sealed
 from bake_core.spec import OUTPUTS, parse_spec
 from tests.baking import bake_example, maps
@@ -139,7 +139,7 @@ def test_no_ray_gets_out(tmp_path: Path, image: bool) -> None:
     bundle = bake_example(folders["sealed"], example, environment=bright)
     assert any("sealed off" in x["why"] for x in bundle.manifest["left_out"])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bake_core.bake.is_sealed", lambda scene, tracer, positions: False)
+        patch.setattr("bake_core.prepared.is_sealed", lambda scene, tracer, positions: False)
         unproven = bake_example(folders["open"], example, environment=bright)
     assert not any("sealed off" in x["why"] for x in unproven.manifest["left_out"])
     np.testing.assert_array_equal(maps(bundle), maps(dark))

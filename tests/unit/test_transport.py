@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from bake_core import tally
 from bake_core.allocation import Allocation
-from bake_core.bake import Prepared, prepare, trace_shard
 from bake_core.examples import closed_box, two_rooms
 from bake_core.gltf.writer import GlbWriter, Part, look_at
 from bake_core.picture import Picture, path_trace_picture
+from bake_core.prepared import Prepared, prepare
 from bake_core.scene import Camera, Scene
+from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
 from bake_core.stability.scenes import box_with_hole
 from bake_core.stability.scenes import scene as glb_of

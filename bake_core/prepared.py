@@ -1,0 +1,111 @@
+"""What a bake needs before its first ray: probes in their places, what is kept, what rays ask."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.environment import Find, no_images, read_environment
+from bake_core.parameters import LARGEST
+from bake_core.placement import Volume, place
+from bake_core.reach import probes_about_surfaces
+from bake_core.relocation import relocate
+from bake_core.scene import Scene
+from bake_core.sealed import is_sealed
+from bake_core.selection import LeftOut, Selection, select
+from bake_core.shader_constants import biases
+from bake_core.spec import Spec
+from bake_core.tracer import Tracer
+from bake_core.unneeded import unneeded
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A function of scene and spec only.
+
+    Attributes
+    ----------
+    positions : (n, 3) float64
+        Of all probes of all volumes in turn, local frame.
+    offsets : (n, 3) float32
+        By how much they were moved from their lattice points.
+    limits, units : (n,) float64
+        Each probe's distance limit, and the smallest spacing of its volume, metres.
+    needed : (n,) bool
+        Which of them are baked at all, unless they turn out to stand inside a solid.
+    tracer : Tracer
+        What probes are traced with.
+    whole : Tracer
+        The scene as it is: what audits look at. It has an environment that `tracer` may do without.
+    """
+
+    scene: Scene
+    spec: Spec
+    volumes: tuple[Volume, ...]
+    selection: Selection
+    tracer: Tracer
+    whole: Tracer
+    positions: NDArray[np.float64]
+    offsets: NDArray[np.float32]
+    limits: NDArray[np.float64]
+    units: NDArray[np.float64]
+    needed: NDArray[np.bool_]
+
+    @property
+    def probe_count(self) -> int:
+        return len(self.positions)
+
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Outputs first, then what kernels do without."""
+        return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
+
+
+def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
+    """Place the probes, choose the outputs, build the acceleration structure.
+
+    Parameters
+    ----------
+    find : callable, optional
+        Where an image that the spec names lies; in what is prepared it is named by its digest.
+
+    Raises
+    ------
+    SpecError, SceneError
+    """
+    volumes = place(scene, spec)
+    environment, named = read_environment(spec.environment, find)
+    spec = spec.model_copy(update={"environment": named})
+    positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
+    whole = Tracer.build(scene, spec, environment)
+    offsets = np.zeros(positions.shape, np.float32)
+    if spec.probes == "relocated":
+        offsets = relocate(whole, volumes, positions)
+        positions = positions + offsets
+    shines = environment.sky is not None or bool(environment.constant.any())
+    return Prepared(
+        scene=scene,
+        spec=spec,
+        volumes=volumes,
+        selection=select(scene, spec, volumes),
+        tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
+        whole=whole,
+        positions=positions,
+        offsets=offsets,
+        limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
+        units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
+        needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
+    )
+
+
+def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:
+    """Which probes any query on a surface asks, (n,) bool, of all volumes in turn: :func:`bake_core.reach.probes_about_surfaces`.
+
+    Surfaces are taken as far off as a query moves its point before it asks for visibility, which bounds what a renderer does to points.
+    """
+    counts = [np.asarray(v.counts, np.int64) for v in volumes]
+    margins = [sum(biases(LARGEST, v.spacing, n)) for v, n in zip(volumes, counts, strict=True)]
+    return np.concatenate([probes_about_surfaces(scene, v, margin) for v, margin in zip(volumes, margins, strict=True)])
