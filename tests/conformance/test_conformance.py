@@ -1,4 +1,4 @@
-"""The fixtures are up to date, and the numpy twin agrees with what they say when it reads nothing but them."""
+"""The fixtures are up to date, and the numpy twin and GLSL on every host agree with what they say, reading nothing but them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bake_core import irradiance
 from bake_core.bundle import Atlas, VolumeData
 from bake_core.octahedral import dir_to_oct, oct_to_dir, with_border
 from tests.conformance import generate
+from tests.glsl import Host
 
 
 def fixture(name: str) -> Any:
@@ -81,3 +82,48 @@ def test_irradiance_query() -> None:
     np.testing.assert_array_equal(found.probes, columns["probes"])
     np.testing.assert_allclose(found.weights, columns["weights"], atol=1e-6)
     np.testing.assert_allclose(found.irradiance, columns["irradiance"], atol=1e-6)
+
+
+def columns_of(rows: list[dict[str, Any]], *names: str) -> list[Any]:
+    return [np.array([row[name] for row in rows]) for name in names]
+
+
+def test_octahedral_map_in_glsl(host: Host) -> None:
+    data = fixture("octahedral.json")
+    directions, encoded = columns_of(data["dir_to_oct"], "direction", "oct")
+    found = host("void answer(vec4 given[1], out vec4 found[1]) { found[0].xy = obDirToOct(given[0].xyz); }", [directions], 1, ())
+    np.testing.assert_allclose(found[:, 0, :2], encoded, atol=3e-7)
+    squares, decoded = columns_of(data["oct_to_dir"], "oct", "direction")
+    points = np.concatenate([squares, np.zeros((len(squares), 1))], -1)
+    found = host("void answer(vec4 given[1], out vec4 found[1]) { found[0].xyz = obOctToDir(given[0].xy); }", [points], 1, ())
+    np.testing.assert_allclose(found[:, 0, :3], decoded, atol=3e-7)
+
+
+def test_grid_in_glsl(host: Host) -> None:
+    data = fixture("grid.json")
+    # The same three volumes, with what a module is not made without.
+    volumes = [volume_of(v) for v in fixture("irradiance.json")["volumes"]]
+    positions, volume, base, fraction = columns_of(data["queries"], "position", "volume", "base", "fraction")
+    answer = """
+    void answer(vec4 given[1], out vec4 found[2]) {
+        int v = obSelectVolume(given[0].xyz);
+        ObCell cell = obCell(obVolume(v), given[0].xyz);
+        found[0] = vec4(vec3(cell.base), float(v));
+        found[1] = vec4(cell.fraction, 0.0);
+    }
+    """
+    found = host(answer, [positions], 2, volumes)
+    np.testing.assert_array_equal(found[:, 0], np.concatenate([base, volume[:, None]], -1))
+    np.testing.assert_allclose(found[:, 1, :3], fraction, atol=2e-6)
+
+
+def test_irradiance_query_in_glsl(host: Host) -> None:
+    data = fixture("irradiance.json")
+    volumes = [volume_of(v) for v in data["volumes"]]
+    *points, expected = columns_of(data["queries"], "position", "normal", "wo", "irradiance")
+    answer = """
+    void answer(vec4 given[3], out vec4 found[1]) { found[0].xyz = obIrradiance(given[0].xyz, given[1].xyz, given[2].xyz); }
+    """
+    found = host(answer, points, 1, volumes)
+    brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
+    np.testing.assert_allclose(found[:, 0, :3], expected, atol=5e-6 * brightest)
