@@ -18,6 +18,8 @@ const int OB_MISS = 2;
 const float OB_TOLERANCE = 0.5;
 // Of a cell's diagonal: a ray that starts on a probe has no direction from there. Nothing but the probe itself is so near to it.
 const float OB_START = 1.0 / 1048576.0;
+// Of a cell's diagonal and the way behind: a probe that takes a ray less far has only rounded it otherwise, and would answer for others.
+const float OB_PROGRESS = 1.0 / 4096.0;
 // Where there is none before the end of the ray, which is 1.
 const float OB_NEVER = 2.0;
 const float OB_FAR = 3.0e38;
@@ -346,7 +348,7 @@ ObTrace obTrace(vec3 position, vec3 direction) {
             if (found.verdict != OB_UNKNOWN) {
                 return ObTrace(found.verdict, found.at, found.normal, v, probe, vec3(0.0));
             }
-            if (found.at > t) {
+            if (found.at > t + OB_PROGRESS * (t + scale)) {
                 t = found.at;
                 lost.distance = t;
                 lost.volume = v;

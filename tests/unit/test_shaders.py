@@ -65,17 +65,17 @@ def test_tracing_agrees_with_its_numpy_twin(host: Host, n: int, normals: int, li
     for roughness, found in zip(all_roughness, host(TRACE, given, 3, volumes).reshape(3, len(o), 3, 4), strict=True):
         same = found[:, 1, 3] == expected.verdict
         # A ray along an edge goes to one side of it in float32 and to the other in float64.
-        assert same.mean() > 0.9995
-        assert (found[:, 2, 3] == expected.volume).mean() > 0.998
+        assert same.mean() > 0.9994
         hit = same & (expected.verdict == light_field.HIT) & np.isclose(found[:, 0, 3], expected.distance, rtol=0, atol=1e-4)
         assert hit.sum() > 0.9995 * (same & (expected.verdict == light_field.HIT)).sum()
         np.testing.assert_allclose(found[hit, 1, :3], expected.normal[hit], atol=1e-6)
         light_there = light_field.arriving(volumes, expected, o, d, roughness)
         counts = np.array([v.counts for v in volumes])[found[:, 2, 3].astype(int)]
         probe = (found[:, 2, :3] * np.stack([np.ones(len(o)), counts[:, 0], counts[:, 0] * counts[:, 1]], -1)).sum(-1)
-        alike = (hit | (same & (expected.verdict == light_field.MISS))) & (probe == expected.probe)
-        assert alike.mean() > 0.9
-        np.testing.assert_allclose(found[alike, 0, :3], light_there[alike], atol=2e-3)
+        alike = (probe == expected.probe) & (found[:, 2, 3] == expected.volume)
+        assert alike.mean() > 0.997
+        alike &= hit | (same & (expected.verdict != light_field.HIT))
+        np.testing.assert_allclose(found[alike, 0, :3], light_there[alike], atol=2e-4)
         assert np.isfinite(found[:, 0, :3]).all()
 
 
