@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bake_core import irradiance, light_field
+from bake_core.assemble import PARAMETERS
 from bake_core.octahedral import dir_to_oct, oct_to_dir
 from bake_core.shader_compiler import compile_glsl
 from tests import compile_shaders
@@ -49,6 +52,21 @@ def test_the_irradiance_query_agrees_with_its_numpy_twin(host: Host) -> None:
     brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
     assert np.isfinite(found).all()
     assert difference.max() < 5e-6 * brightest, f"worst at {points[0][difference.argmax()]}"
+
+
+def test_the_irradiance_query_agrees_with_its_numpy_twin_in_shadows_as_sharp_as_a_bakes(host: Host) -> None:
+    """There, rounding moves a point through a hundred-thousandth of a shadow's width: few points are so near to an edge that it shows."""
+    volumes = [replace(volume, parameters=dict(PARAMETERS)) for volume in synthetic.volumes()]
+    rng = np.random.default_rng(1)
+    positions = (rng.uniform(size=(50000, 3)) * [16, 9, 9] - [6, 4, 4.5]).astype(np.float32).astype(np.float64)
+    normals, wo = rng.normal(size=(2, 50000, 3))
+    wo *= np.sign((normals * wo).sum(-1, keepdims=True))
+    normals, wo = (d / np.linalg.norm(d, axis=-1, keepdims=True) for d in (normals, wo))
+    found = host(QUERY, [positions, normals, wo], 2, volumes)[:, 0, :3]
+    difference = np.abs(found - irradiance.sample(volumes, positions, normals, wo).irradiance).max(-1)
+    brightest = max(float(v.atlases["irradiance"].texels.max()) for v in volumes)
+    assert np.quantile(difference, 0.999) < 5e-6 * brightest
+    assert difference.max() < 1e-3 * brightest, f"worst at {positions[difference.argmax()]}"
 
 
 @pytest.mark.parametrize(("n", "normals", "light"), [(64, 64, 16), (18, 12, 8)])
