@@ -4,7 +4,7 @@ BIN := .venv/bin
 LOCKS := requirements.txt requirements-dev.txt
 PROJECTS := pyproject.toml clients/python/pyproject.toml
 
-.PHONY: help setup system-packages demo check test test-slow chaos service-figures image-test lock clean
+.PHONY: help setup system-packages demo check test test-slow test-drivers chromium chaos service-figures image-test lock clean
 .DELETE_ON_ERROR:
 
 help:
@@ -12,6 +12,8 @@ help:
 	@echo "make demo        setup; then serve, upload, bake and verify a Cornell box: pictures and figures in out/demo"
 	@echo "make test        setup; then every test but the slow ones (ARGS=... goes to pytest)"
 	@echo "make test-slow   setup; then the tests that take minutes"
+	@echo "make chromium    headless Chromium in build/, where tests find a second Vulkan driver and a WebGL2 (Debian; nothing is installed)"
+	@echo "make test-drivers   setup, chromium; then the GLSL module on lavapipe, on SwiftShader and on WebGL2"
 	@echo "make chaos       setup; then 1,000 random kills of a service and its worker, about an hour (ARGS=\"--kills N --seed S\")"
 	@echo "make service-figures   setup; then what the service holds under load, two minutes on a quiet machine"
 	@echo "make image-test  build docker/Dockerfile with buildah (root, Debian), start it, bake and verify through it"
@@ -42,6 +44,14 @@ test: setup
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+test-drivers: setup chromium
+	$(BIN)/python -m pytest tests/conformance tests/unit/test_shaders.py tests/unit/test_vulkan.py $(ARGS)
+
+chromium: build/chromium
+
+build/chromium:
+	@.ci/chromium
 
 chaos: setup
 	$(BIN)/python -m tests.service.chaos $(ARGS)

@@ -44,6 +44,8 @@ UNKNOWN, HIT, MISS = 0, 1, 2
 TOLERANCE = 0.5
 # Of a cell's diagonal: a ray that starts on a probe has no direction from there. Nothing but the probe itself is so near to it.
 _START = 2.0**-20
+# Of a cell's diagonal and the way behind: a probe that takes a ray less far has only rounded it otherwise, and would answer for others.
+PROGRESS = 2.0**-12
 # The corners of a cell by how many sides lie between them and the nearest one, three bits each.
 _ORDER = 0x76534210
 
@@ -225,7 +227,7 @@ def trace_ray(field, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
             verdict, end, normal = _trace_probe(field, tile, scale, (ox - c[0], oy - c[1], oz - c[2]), (dx, dy, dz), t)
             if verdict != UNKNOWN:
                 return verdict, end, normal, v, probe, asked
-            if end > t:
+            if end > t + PROGRESS * (t + scale):
                 t, last_v, last_probe = end, v, probe
         rounds += 1
         # A ray crosses no more cells than so many; one that no probe of its cell takes any farther is lost.

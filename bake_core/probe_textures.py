@@ -69,7 +69,12 @@ def _maps(volumes: Sequence[VolumeData]) -> tuple[_Map, ...]:
 
 def probe_textures(device: Device, volumes: Sequence[VolumeData]) -> list[Image]:
     """Irradiance, walls and the probe tables of all volumes; and what rays are traced through, where they have it."""
-    return [texture(device, _stacked([_four(m.texels(v)) for v in volumes]), linear=m.linear) for m in _maps(volumes)]
+    return [texture(device, texels, linear=linear) for texels, linear in probe_layers(volumes)]
+
+
+def probe_layers(volumes: Sequence[VolumeData]) -> list[tuple[F32, bool]]:
+    """What :func:`probe_textures` uploads: texels (layers, height, width, 1 or 4) float32, and whether they are filtered."""
+    return [(_stacked([_four(m.texels(v)) for v in volumes]), m.linear) for m in _maps(volumes)]
 
 
 def probe_module(volumes: Sequence[VolumeData], first_binding: int, frame: ArrayLike = (0.0, 0.0, 0.0)) -> str:

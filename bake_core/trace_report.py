@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 from collections.abc import Callable
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.bundle import Bundle, content_digest, dump_json
-from bake_core.drawing import Colour, Drawing, Line, Text, as_svg
+from bake_core.drawing import as_svg
 from bake_core.environment import Find, read_environment
-from bake_core.error_plot import INK, log_frame, ticks
 from bake_core.errors import BundleError, InputError
 from bake_core.images import write_drawing
 from bake_core.light_field import Traces, light_field, trace
 from bake_core.scene import Scene
 from bake_core.spec import SMALLEST_RESOLUTION, parse_spec
 from bake_core.trace_check import FOOTPRINTS, compare_traces, draw_rays
+from bake_core.trace_picture import picture
 from bake_core.trace_shader import trace_on_device
 from bake_core.trace_variants import looked_again, thinned
 from bake_core.tracer import Tracer
@@ -36,7 +35,6 @@ _STEPS = (1, 2, 4)
 _SCALES = (1 / 4, 1 / 2, 1, 2)
 # More texels along the side of an atlas than every device takes.
 _LARGEST_ATLAS = 16384
-_COLOURS: tuple[Colour, ...] = ((0, 90, 181), (220, 50, 32), (120, 120, 120))
 _COLUMNS = ("agree", "false_hits", "late_hits", "false_misses", "unknown")
 
 
@@ -55,9 +53,8 @@ def trace_check(
     -------
     dict
         ``rays``, ``device`` and ``rows``; each row has ``volumes`` (spacing and probes of each), ``spacing`` (how many times the bundle's),
-        ``resolution``, ``bundle`` (whether it is the bundle as it stands), and under ``python`` an
-        :class:`bake_core.trace_check.Agreement`; under ``glsl``, too, with the bundle's own resolution: a driver takes seconds to compile
-        the module for each.
+        ``resolution``, ``bundle`` (whether it is the bundle as it stands), and under ``python`` and ``glsl`` an
+        :class:`bake_core.trace_check.Agreement`.
 
     Raises
     ------
@@ -98,12 +95,11 @@ def trace_check(
                 continue
             tell(f"{step} × the spacing, {side} × {side} texels")
             volumes = sparse if scale == 1 else looked_again(tracer, sparse, side, flag)
-            python = trace(light_field(volumes), drawn.origins, drawn.directions)
-            found: dict[str, Traces] = {"python": python}
-            if scale == 1:
-                with Device() as device:
-                    found["glsl"] = trace_on_device(device, volumes, drawn.origins, drawn.directions, scene.origin)
-                    name = device.name
+            found: dict[str, Traces] = {"python": trace(light_field(volumes), drawn.origins, drawn.directions)}
+            # One for each, as nothing that is made on a device goes before it does.
+            with Device() as device:
+                found["glsl"] = trace_on_device(device, volumes, drawn.origins, drawn.directions, scene.origin)
+                name = device.name
             rows.append(
                 {
                     "spacing": step,
@@ -129,7 +125,7 @@ def table(report: dict[str, Any]) -> list[tuple[str, ...]]:
     heads = ("spacing", "texels", "by", "agree", "false hits", "late hits", "false misses", "unknown", "error", "p95", "probes")
     out: list[tuple[str, ...]] = [heads]
     for row in report["rows"]:
-        for who in (who for who in ("python", "glsl") if who in row):
+        for who in ("python", "glsl"):
             a = row[who]
             shares = [f"{100 * a[name]:.2f} %" for name in _COLUMNS]
             probes = f"{a['probes']:.2f}" if who == "python" else ""
@@ -137,31 +133,6 @@ def table(report: dict[str, Any]) -> list[tuple[str, ...]]:
             first = (f"× {row['spacing']}{mark}", f"{row['resolution']}²", who)
             out.append((*first, *shares, f"{a['error']:.3g} m", f"{a['p95']:.3f}", probes))
     return out
-
-
-def picture(report: dict[str, Any]) -> Drawing:
-    """Rays that are wrong or unknown (whole lines), and false hits (dots alone), against resolution, a colour for each spacing."""
-    rows = [row for row in report["rows"] if row["python"]["agree"] < 1]
-    lines: list[Line] = []
-    texts = [Text((70.5, 24), "Rays that do not agree with Embree (lines), and false hits (dots)", 15, INK, "start")]
-    if not rows:
-        return Drawing(720, 420, lines, [*texts, Text((360, 210), "every ray agrees", 13, INK, "middle")])
-    wrong = [100 * (1 - row["python"]["agree"]) for row in rows]
-    hits = [100 * row["python"]["false_hits"] for row in rows if row["python"]["false_hits"] > 0]
-    box = (70.5, 56.5, 560.5, 360.5)
-    at = log_frame(
-        lines, texts, box, ticks([row["resolution"] for row in report["rows"]], 2), ticks(wrong + hits, 10), "texels along a side"
-    )
-    for i, step in enumerate(sorted({row["spacing"] for row in rows})):
-        colour = _COLOURS[i % len(_COLOURS)]
-        of = [row for row in rows if row["spacing"] == step]
-        places = [at(row["resolution"], 100 * (1 - row["python"]["agree"])) for row in of]
-        lines += [Line(a, b, colour, 2) for a, b in pairwise(places)] + [Line(a, a, colour, 5) for a in places]
-        dots = [at(row["resolution"], 100 * row["python"]["false_hits"]) for row in of if row["python"]["false_hits"] > 0]
-        lines += [Line(a, a, colour, 9) for a in dots]
-        probes = sum(v["probes"] for v in of[0]["volumes"])
-        texts.append(Text((575, 76 + 20 * i), f"× {step}: {probes} probes", 13, colour, "start"))
-    return Drawing(720, 420, lines, texts)
 
 
 def write_report(report: dict[str, Any], out: Path) -> Path:

@@ -18,6 +18,8 @@ const int OB_MISS = 2;
 const float OB_TOLERANCE = 0.5;
 // Of a cell's diagonal: a ray that starts on a probe has no direction from there. Nothing but the probe itself is so near to it.
 const float OB_START = 1.0 / 1048576.0;
+// Of a cell's diagonal and the way behind: a probe that takes a ray less far has only rounded it otherwise, and would answer for others.
+const float OB_PROGRESS = 1.0 / 4096.0;
 // Where there is none before the end of the ray, which is 1.
 const float OB_NEVER = 2.0;
 const float OB_FAR = 3.0e38;
@@ -54,6 +56,7 @@ struct ObSweep {
     vec3 e;
 };
 
+// Where it has come to at s, as the probe sees it.
 vec3 obPoint(ObSweep sweep, float s) {
     return (1.0 - s) * sweep.q + s * sweep.e;
 }
@@ -75,7 +78,7 @@ int obNearestSide(int n, int level) {
     return side;
 }
 
-// Size of a tile of that chain, and where in it a level begins: the first stands at the left, the others one below another at its right.
+// Where in a tile of that chain a level begins: the first stands at the left, the others one below another at its right.
 ivec2 obNearestPlace(int n, int level) {
     int y = 0;
     for (int k = 2; k < level; ++k) {
@@ -84,6 +87,7 @@ ivec2 obNearestPlace(int n, int level) {
     return level > 1 ? ivec2(obNearestSide(n, 1), y) : ivec2(0);
 }
 
+// Size of a whole tile of that chain.
 ivec2 obNearestSize(ObLightField field) {
     int first = obNearestSide(field.distanceTexels, 1);
     if (field.nearestLevels == 1) {
@@ -346,7 +350,7 @@ ObTrace obTrace(vec3 position, vec3 direction) {
             if (found.verdict != OB_UNKNOWN) {
                 return ObTrace(found.verdict, found.at, found.normal, v, probe, vec3(0.0));
             }
-            if (found.at > t) {
+            if (found.at > t + OB_PROGRESS * (t + scale)) {
                 t = found.at;
                 lost.distance = t;
                 lost.volume = v;
@@ -385,6 +389,7 @@ vec3 obBlurred(int v, ObVolume volume, ObLightField field, ivec3 tile, int level
     return OB_GLOSS(v, vec3(texel / vec2(volume.tiles * size), float(tile.z)));
 }
 
+// The same for any alpha, between two levels of the chain. Karis 2013 and Lagarde and de Rousiers 2014 look up levels likewise.
 vec3 obRadianceOfProbe(int v, ObVolume volume, ivec3 tile, vec3 direction, float alpha) {
     ObLightField field = obLightField(v);
     float level = alpha <= field.glossAlpha

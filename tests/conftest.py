@@ -8,6 +8,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests import glsl
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
@@ -16,6 +18,18 @@ def shared() -> Path:
     if not (folder / "scenes").is_dir():
         pytest.skip("no shared/ folder beside this checkout: its scenes are not ours to ship")
     return folder
+
+
+@pytest.fixture(params=["lavapipe", "swiftshader", "webgl2"])
+def host(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> glsl.Host:
+    """What runs GLSL, each in turn: Mesa's Vulkan driver, Chromium's, and Chromium's WebGL2."""
+    if request.param != "lavapipe" and not glsl.SWIFTSHADER.is_file():
+        pytest.skip(f"{request.param} comes with Chromium, which is not in build/chromium; `make chromium` fetches it")
+    if request.param == "webgl2":
+        return glsl.on_webgl2
+    if request.param == "swiftshader":
+        monkeypatch.setenv("VK_DRIVER_FILES", str(glsl.SWIFTSHADER))
+    return glsl.on_vulkan
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 Vector = tuple[float, float, float]
 
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core.bundle import read_bundle
     from bake_core.errors import InputError
-    from bake_core.irradiance import sample
+    from bake_core.irradiance import sample, volume_shares
 
     if len(args.at) != len(args.normal):
         raise InputError("sample.usage", f"{len(args.at)} --at and {len(args.normal)} --normal: give one normal for each point", "--normal")
@@ -50,32 +51,39 @@ def run(args: argparse.Namespace) -> int:
     volumes = read_bundle(args.bundle).volumes
     if "irradiance" not in volumes[0].atlases:
         raise InputError("sample.no_irradiance", "the bundle holds no irradiance; bake it with that output", str(args.bundle))
-    answer = sample(volumes, positions, normals / lengths)
-    if args.json:
-        document = {
-            "samples": [
-                {
-                    "position": list(position),
-                    "normal": list(normal),
-                    "irradiance": answer.irradiance[i].tolist(),
-                    "volume": volumes[answer.volume[i]].name,
-                    "probes": answer.probes[i].tolist(),
-                    "weights": answer.weights[i].tolist(),
-                }
-                for i, (position, normal) in enumerate(points)
-            ]
-        }
-        print(json.dumps(document, indent=2))
-        return 0
+    answer, shares = sample(volumes, positions, normals / lengths), volume_shares(volumes, positions)
+    samples: list[dict[str, Any]] = []
     for i, (position, normal) in enumerate(points):
-        print(f"at {_text(position)} normal {_text(normal)}: irradiance {' '.join(f'{e:.6g}' for e in answer.irradiance[i])}")
-        weights = [f"{p} × {w:.3f}" for p, w in zip(answer.probes[i], answer.weights[i], strict=True) if w > 0]
-        probes = ", ".join(weights) or "none: not one around it is active, and 0 is no measurement"
-        print(f"  volume {volumes[answer.volume[i]].name}, probes {probes}")
+        # Eight probes for each volume that answers, the finest first; what is behind them is for points that more volumes answer for.
+        count = int((shares[:, i] > 0).sum())
+        answering = answer.volumes[i, : 8 * count : 8]
+        samples.append(
+            {
+                "position": list(position),
+                "normal": list(normal),
+                "irradiance": answer.irradiance[i].tolist(),
+                "volume": volumes[answer.volume[i]].name,
+                "volumes": [{"name": volumes[v].name, "weight": float(shares[v, i])} for v in answering],
+                "probes": answer.probes[i, : 8 * count].tolist(),
+                "weights": answer.weights[i, : 8 * count].tolist(),
+            }
+        )
+    if args.json:
+        print(json.dumps({"samples": samples}, indent=2))
+        return 0
+    for found in samples:
+        irradiance = " ".join(f"{e:.6g}" for e in found["irradiance"])
+        print(f"at {_text(found['position'])} normal {_text(found['normal'])}: irradiance {irradiance}")
+        for k, volume in enumerate(found["volumes"]):
+            eight = slice(8 * k, 8 * k + 8)
+            weights = [f"{p} × {w:.3f}" for p, w in zip(found["probes"][eight], found["weights"][eight], strict=True) if w > 0]
+            probes = ", ".join(weights) or "none: not one around it is active, and 0 is no measurement"
+            part = "" if len(found["volumes"]) == 1 else f" × {volume['weight']:.3f}"
+            print(f"  volume {volume['name']}{part}, probes {probes}")
     return 0
 
 
-def _text(v: Vector) -> str:
+def _text(v: list[float]) -> str:
     return ",".join(f"{x:g}" for x in v)
 
 

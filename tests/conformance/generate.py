@@ -18,11 +18,15 @@ from numpy.typing import ArrayLike
 
 from bake_core import irradiance
 from bake_core.bundle import VolumeData
+from bake_core.light_field import HIT, MISS, UNKNOWN, arriving, light_field, trace
 from bake_core.octahedral import dir_to_oct, oct_to_dir, with_border
 from bake_core.shader_constants import bundle_constants, probe_texels, surface_bias
-from tests.conformance import synthetic
+from bake_core.volume_chains import CHAINS, volume_chain
+from tests.conformance import rooms, synthetic
 
 HERE = Path(__file__).resolve().parent
+VERDICTS = {HIT: "hit", MISS: "miss", UNKNOWN: "unknown"}
+ROUGHNESS = (0.0, 0.35, 0.9)
 
 
 def rounded(values: ArrayLike) -> Any:
@@ -73,6 +77,55 @@ def query() -> dict[str, Any]:
     }
 
 
+def tracing() -> dict[str, Any]:
+    """A room that is open to the sky, with a block in it, two volumes of probes in closed form, and what rays through them meet."""
+    room = rooms.Room(solids=(((-1.2, 0.0, -1.0), (-0.3, 1.7, -0.2)),), open_top=True)
+    volumes = (
+        rooms.volume(room, (-1.5, 0.5, -1.5), (3.0, 2.0, 3.0), (2, 2, 2), n=12, normals=8, light=4, moved=0.05, name="coarse"),
+        rooms.volume(room, (0.5, 0.5, -0.5), (1.0, 1.0, 1.0), (2, 1, 2), n=12, normals=8, light=4, moved=0.1, name="fine"),
+    )
+    field = light_field(volumes)
+    positions, directions = rooms.rays(room, 4000, seed=7)
+    found = trace(field, positions, directions)
+    # Rays of which another rounding would make something else are no fixture.
+    chosen = np.ones(len(positions), np.bool_)
+    for seed in range(8):
+        nudge = np.random.default_rng(seed).uniform(-1e-5, 1e-5, (2, *positions.shape))
+        near = trace(field, positions + nudge[0], directions + nudge[1])
+        chosen &= (near.verdict == found.verdict) & (near.volume == found.volume) & (near.probe == found.probe)
+        chosen &= np.isclose(near.distance, found.distance, rtol=0, atol=1e-3)
+    kinds = np.stack([found.verdict, found.volume], -1)
+    few = np.sort(np.concatenate([np.flatnonzero(chosen & (kinds == kind).all(-1))[:30] for kind in np.unique(kinds, axis=0)]))
+    roughness = np.array(ROUGHNESS)[np.arange(len(positions)) % len(ROUGHNESS)]
+    light = np.zeros_like(positions)
+    for r in ROUGHNESS:
+        light = np.where((roughness == r)[:, None], arriving(volumes, found, positions, directions, r), light)
+    queries = [
+        {
+            "position": rounded(positions[i]),
+            "direction": rounded(directions[i]),
+            "roughness": rounded(roughness[i]),
+            "verdict": VERDICTS[int(found.verdict[i])],
+            "distance": rounded(found.distance[i]) if np.isfinite(found.distance[i]) else None,
+            "normal": rounded(found.normal[i]),
+            "volume": int(found.volume[i]),
+            "probe": int(found.probe[i]),
+            "radiance": rounded(light[i]),
+        }
+        for i in few
+    ]
+    return {
+        "constants.glsl": bundle_constants(volumes).splitlines(),
+        "volumes": [_volume(v) | {"chains": {c: _chain(v, c) for c in CHAINS}} for v in volumes],
+        "queries": queries,
+    }
+
+
+def _chain(volume: VolumeData, chain: str) -> dict[str, Any]:
+    texels = volume_chain(volume, chain)
+    return {"shape": list(texels.shape), "texels": rounded(texels.ravel())}
+
+
 def _lattice(volume: VolumeData) -> dict[str, Any]:
     return {"origin": rounded(volume.origin), "spacing": rounded(volume.spacing), "counts": rounded(volume.counts)}
 
@@ -81,6 +134,7 @@ def _volume(volume: VolumeData) -> dict[str, Any]:
     normal_bias, view_bias = surface_bias(volume)
     atlases = {
         name: {"interior": a.interior, "tile": a.tile, "shape": list(a.texels.shape), "texels": rounded(a.texels.ravel())}
+        | ({"miss": rounded(a.miss)} if np.isfinite(a.miss) else {})
         for name, a in volume.atlases.items()
     }
     probes = probe_texels(volume)
@@ -108,7 +162,12 @@ def text(document: Mapping[str, Any]) -> str:
 
 def files() -> dict[str, str]:
     """Every fixture: file name to text."""
-    return {"octahedral.json": text(octahedral()), "grid.json": text(grid()), "irradiance.json": text(query())}
+    return {
+        "octahedral.json": text(octahedral()),
+        "grid.json": text(grid()),
+        "irradiance.json": text(query()),
+        "trace.json": text(tracing()),
+    }
 
 
 if __name__ == "__main__":

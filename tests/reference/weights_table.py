@@ -1,61 +1,39 @@
-"""The tables of docs/leaks.md: `python tests/reference/weights_table.py [SCENE...]`, and with `--leaks` what gets through a wall of 2 cm.
+"""The tables of docs/leaks.md: `python -m tests.reference.weights_table [SCENE...]`, and with `--leaks` what gets through a wall of 2 cm.
 
 A scene is an example's name, or that of a file in `../shared/scenes` that has its spec in `../shared/specs`. Each is baked with the same
 samples as ours is stored by default, again with its probes relocated, and with RTXGI's resolutions, of which moments are kept in full
 floats here, where RTXGI rounds them. All are asked for irradiance at the receivers of `octobake verify`, RTXGI's with each of 5 × 5 biases.
+`--page docs/leaks.md` puts the rows of the scenes named into the page, and leaves the others'.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
-import os
-import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 import numpy as np
-from numpy.typing import NDArray
 
 from bake_core import published_weights
-from bake_core.bake import bake
-from bake_core.bundle import VolumeData, read_bundle
-from bake_core.examples import Example, cornell, tunnel, two_rooms
+from bake_core.examples import two_rooms
 from bake_core.irradiance import sample
 from bake_core.leaks import leak_ratio
 from bake_core.prepared import prepare
 from bake_core.receiver_comparison import ReceiverFigures, compare_receivers, measure_receivers
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec
+from tests.reference.baked_scenes import F64, THREADS, Ask, Volumes, bake_at, bytes_of, files_of, markdown, ours, publish
 
-F64 = NDArray[np.float64]
-Volumes = tuple[VolumeData, ...]
-
-SHARED = Path(__file__).resolve().parents[3] / "shared"
-EXAMPLES: dict[str, Callable[[], Example]] = {"cornell": cornell, "two_rooms": two_rooms, "tunnel": tunnel}
+SCENES = ("two_rooms", "tunnel", "cornell", "rtxgi_cornell", "rtxgi_two_rooms", "godot_zdm2")
 # Parts of the smallest spacing: each of RTXGI's two, from none that matters to beyond what a cell can bear.
 BIASES = (0.01, 0.05, 0.1, 0.2, 0.3)
-THREADS = os.cpu_count() or 1
 # RTXGI's: 6 texels of 4 bytes, 14 of 4 and borders, and 8 bytes of the probe's own; in all 1,288.
 RTXGI = {"irradiance": 6, "visibility": 14}
-# From each receiver.
-PATHS = 1024
-
-
-def bytes_of(volumes: Volumes) -> int:
-    """What a renderer holds for a probe: irradiance and walls with their borders, and its row of the probe table."""
-    sizes = {"half": 2, "float": 4}
-    held = [volumes[0].atlases[name] for name in ("irradiance", "walls")]
-    return 16 + sum(a.tile**2 * int(a.texels.shape[-1]) * sizes[a.encoding] for a in held)
-
-
-def ours(volumes: Volumes) -> Callable[[F64, F64], F64]:
-    return lambda positions, normals: sample(volumes, positions, normals).irradiance
+RTXGI_BYTES = 1288
+# Of the probe table.
+PROBE_BYTES = 16
 
 
 def with_parameters(volumes: Volumes, bias: float, fade: float) -> Volumes:
@@ -63,7 +41,7 @@ def with_parameters(volumes: Volumes, bias: float, fade: float) -> Volumes:
     return tuple(replace(v, parameters={**v.parameters, **changed}) for v in volumes)
 
 
-def grazing(volumes: Volumes) -> Callable[[F64, F64], F64]:
+def grazing(volumes: Volumes) -> Ask:
     """As a renderer asks: from a viewer who looks along the surface, at 80° to its normal."""
 
     def ask(positions: F64, normals: F64) -> F64:
@@ -74,27 +52,12 @@ def grazing(volumes: Volumes) -> Callable[[F64, F64], F64]:
     return ask
 
 
-def ddgi(volumes: Volumes, biases: tuple[float, float]) -> Callable[[F64, F64], F64]:
+def ddgi(volumes: Volumes, biases: tuple[float, float]) -> Ask:
     return lambda positions, normals: published_weights.ddgi(volumes, positions, normals, biases)
 
 
-def bake_at(scene: Path, document: dict[str, object], resolution: dict[str, int], samples: int, folder: Path) -> Volumes:
-    stop = {"target_error": None, "max_samples": samples}
-    spec = parse_spec({**document, "outputs": ["irradiance", "visibility"], "resolution": resolution, "stop": stop})
-    bake(scene, spec, folder / "bundle", threads=THREADS, audit_seconds=0)
-    return read_bundle(folder / "bundle").volumes
-
-
-def files_of(name: str, folder: Path) -> tuple[Path, dict[str, object]]:
-    if name in EXAMPLES:
-        glb, document = EXAMPLES[name]()
-        (folder / "scene.glb").write_bytes(glb)
-        return folder / "scene.glb", document
-    return SHARED / "scenes" / f"{name}.glb", json.loads((SHARED / "specs" / f"{name}.json").read_text())
-
-
-def compare(name: str, samples: int) -> None:
-    """Print a scene's rows."""
+def compare(name: str, samples: int, paths: int) -> str:
+    """A scene's section: what each way to store and to weigh costs, and how far it is from the truth."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         scene_path, document = files_of(name, folder)
@@ -103,35 +66,41 @@ def compare(name: str, samples: int) -> None:
         theirs = bake_at(scene_path, document, RTXGI, samples, folder)
         scene = load_scene(scene_path)
         tracer = prepare(scene, parse_spec(document)).tracer
-        receivers, answers, estimates = measure_receivers(scene, tracer, mine, samples=PATHS, threads=THREADS)
+        receivers, answers, estimates = measure_receivers(scene, tracer, mine, samples=paths, threads=THREADS)
 
-        def figures(ask: Callable[[F64, F64], F64]) -> ReceiverFigures:
-            return compare_receivers(ask(receivers.positions, receivers.normals), estimates)
+    def figures(ask: Ask) -> ReceiverFigures:
+        return compare_receivers(ask(receivers.positions, receivers.normals), estimates)
 
-        swept = {pair: figures(ddgi(theirs, pair)) for pair in itertools.product(BIASES, BIASES)}
-        best = min(swept, key=lambda pair: swept[pair].relmse or 0)
-        rows = {
-            "trilinear": (figures(lambda p, n: published_weights.trilinear(theirs, p, n)), 1288),
-            "DDGI, published biases": (figures(ddgi(theirs, published_weights.DDGI_BIASES)), 1288),
-            f"DDGI, best of 25: {best[0]:g}, {best[1]:g}": (swept[best], 1288),
-            "octobake": (compare_receivers(answers, estimates), bytes_of(mine)),
-            "octobake, probes relocated": (figures(ours(moved)), bytes_of(moved)),
-        }
-        least = swept[best].relmse or 0
-        gains = [least / f.relmse for f, _ in list(rows.values())[3:] if f.relmse]
-        noise = rows["octobake"][0].reference_noise
-        print(f"{name}: {len(receivers)} receivers, noise {noise:.1g}; best of 25 over octobake: {', '.join(f'{g:.2f}' for g in gains)}")
-        others = [figures(ours(with_parameters(mine, bias, fade))).relmse or 0 for bias in (0.1, 0.15, 0.2) for fade in (0.01, 0.02, 0.05)]
-        print(f"  octobake with biases from 0.1 to 0.2 and fades from 1 % to 5 %: relMSE from {min(others):.4f} to {max(others):.4f}")
-        for way, (f, size) in rows.items():
-            print(
-                f"  {way:32s} {size:5d} B  relMSE {f.relmse:8.4f}  95th percentile {f.p95:6.3f}  mean ratio {f.mean_ratio:6.3f}", flush=True
-            )
+    swept = {pair: figures(ddgi(theirs, pair)) for pair in itertools.product(BIASES, BIASES)}
+    best = min(swept, key=lambda pair: swept[pair].relmse or 0)
+    own = compare_receivers(answers, estimates)
+    rows = {
+        "trilinear": (figures(lambda p, n: published_weights.trilinear(theirs, p, n)), RTXGI_BYTES),
+        "DDGI, published biases": (figures(ddgi(theirs, published_weights.DDGI_BIASES)), RTXGI_BYTES),
+        f"DDGI, best of 25: {best[0]:g}, {best[1]:g}": (swept[best], RTXGI_BYTES),
+        "octobake": (own, held(mine)),
+        "octobake, probes relocated": (figures(ours(moved)), held(moved)),
+    }
+    others = [figures(ours(with_parameters(mine, bias, fade))).relmse or 0 for bias in (0.1, 0.15, 0.2) for fade in (0.01, 0.02, 0.05)]
+    least = swept[best].relmse or 0
+    cells = [
+        (way, f"{size}", f"{f.relmse:.4f}", f"{f.p95:.3f}", f"{f.mean_ratio:.3f}", f"{least / f.relmse:.2f}" if f.relmse else "")
+        for way, (f, size) in rows.items()
+    ]
+    return (
+        f"`{name}`: {len(receivers)} receivers; relMSE of the reference's own noise {own.reference_noise:.1g}, of octobake with biases "
+        f"from 0.1 to 0.2 and fades from 1 % to 5 % {min(others):.4f} to {max(others):.4f}\n\n"
+        + markdown(("", "bytes a probe", "relMSE", "95th percentile", "mean ratio", "best of 25 over it"), cells)
+    )
 
 
-def leaks() -> None:
-    """Print the leak ratio by scale, resolution and way to ask."""
-    print(f"{'scale':>6s} {'maps':>5s} {'trilinear':>10s} {'DDGI':>9s} {'best of 25':>10s} {'octobake':>10s} {'seen along':>10s}")
+def held(volumes: Volumes) -> int:
+    return PROBE_BYTES + sum(bytes_of(volumes, name) for name in ("irradiance", "walls"))
+
+
+def leaks() -> str:
+    """The leak ratio by scale, resolution and way to ask."""
+    rows = []
     for scale, side in ((1.0, 16), (1.0, 14), (1.0, 12), (1.0, 10), (1.0, 8), (1e-3, 16), (1e4, 16)):
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
@@ -145,20 +114,23 @@ def leaks() -> None:
             leak_ratio(ours(volumes), scale),
             leak_ratio(grazing(volumes), scale),
         ]
-        print(f"{scale:6g} {side:4d}² " + " ".join(f"{100 * way:9.3f}%" for way in ways), flush=True)
+        rows.append((f"{scale:g}", f"{side}²", *(f"{100 * way:.3f} %" for way in ways)))
+    return markdown(("scale", "maps", "trilinear", "DDGI", "best of 25", "octobake", "seen along"), rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("scenes", nargs="*", default=[*EXAMPLES])
+    parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--paths", type=int, default=1024, help="from each receiver")
     parser.add_argument("--leaks", action="store_true")
+    parser.add_argument("--page", type=Path)
     arguments = parser.parse_args()
     if arguments.leaks:
-        leaks()
+        publish(arguments.page, "leaks", leaks())
         return
     for name in arguments.scenes:
-        compare(name, arguments.samples)
+        publish(arguments.page, name, compare(name, arguments.samples, arguments.paths))
 
 
 if __name__ == "__main__":

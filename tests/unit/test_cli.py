@@ -11,6 +11,7 @@ import sys
 import time
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from bake_core.examples import closed_box, square_emitter
 from bake_core.progress import Progress
 from service.cli import COMMANDS, main, parser
 from service.cli.progress import ProgressLine, count
+from tests.conformance import synthetic
 from tests.faults.corpus import Fault, corpus
 
 FEW = {"target_error": None, "max_samples": 4}
@@ -349,6 +351,27 @@ def test_sample_is_the_numpy_twin(baked: Path, tmp_path: Path, capsys: pytest.Ca
     assert {s["volume"] for s in told} == {"between"}
     assert main(["sample", str(baked), "--at=-1,0,0", "--normal", "0,1,0"]) == 0
     assert "irradiance" in capsys.readouterr().out
+
+
+def test_sample_names_the_volumes_that_answer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """In the finer one, a quarter of its spacing beyond it along x, and far from it."""
+    monkeypatch.setattr("bake_core.bundle.read_bundle", lambda path: SimpleNamespace(volumes=synthetic.volumes()))
+    points = ["-0.9,0.1,0.7", "-1.125,0.1,0.7", "1,-1,1"]
+    words = ["sample", "b", *(f"--at={p}" for p in points), *["--normal=0,1,0"] * 3]
+    assert main([*words, "--json"]) == 0
+    told = document(capsys)["samples"]
+    assert [s["volumes"] for s in told] == [
+        [{"name": "fine", "weight": 1.0}],
+        [{"name": "fine", "weight": 0.5}, {"name": "coarse", "weight": 0.5}],
+        [{"name": "coarse", "weight": 1.0}],
+    ]
+    for sample in told:
+        assert len(sample["probes"]) == len(sample["weights"]) == 8 * len(sample["volumes"])
+        eights = np.reshape(sample["weights"], (-1, 8)).sum(1)
+        np.testing.assert_allclose(eights, [v["weight"] for v in sample["volumes"]])
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "volume fine × 0.500, probes" in said and "volume coarse × 0.500, probes" in said
 
 
 @pytest.mark.parametrize(

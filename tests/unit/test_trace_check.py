@@ -22,19 +22,18 @@ OUTPUTS = ["irradiance", "visibility", "radiance", "distance", "normal"]
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stop = {"target_error": None, "max_samples": 1}
-    bake_example(tmp_path, closed_box(0.5, 1.0, 0), outputs=OUTPUTS, stop=stop, resolution={"distance": 16, "normal": 16, "radiance": 8})
+    bake_example(tmp_path, closed_box(0.5, 1.0, 0), outputs=OUTPUTS, stop=stop, resolution={"distance": 4, "normal": 4, "radiance": 8})
     out = tmp_path / "checked"
     scene = str(tmp_path / "scene.glb")
     assert main(["trace-check", str(tmp_path / "bundle"), "--scene", scene, "--rays", "500", "-o", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == json.loads((out / "trace-check.json").read_text())
     assert (report["rays"], report["misses"]) == (500, 0.0)
-    assert [(row["spacing"], row["resolution"]) for row in report["rows"]] == [(s, r) for s in (1, 2) for r in (4, 8, 16, 32)]
+    assert [(row["spacing"], row["resolution"]) for row in report["rows"]] == [(s, r) for s in (1, 2) for r in (2, 4, 8)]
     for row in report["rows"]:
-        assert ("glsl" in row) == (row["resolution"] == 16)
-        for who in row.keys() & {"python", "glsl"}:
+        for who in ("python", "glsl"):
             # One wall is as good as known by any four texels on it; where three walls meet, few texels are too few.
-            assert row[who]["agree"] > (0.95 if row["resolution"] < 16 else 0.99)
+            assert row[who]["agree"] > (0.95 if row["resolution"] > 2 else 0.9)
             assert sum(row[who][k] for k in ("agree", "false_hits", "late_hits", "false_misses", "unknown")) == pytest.approx(1)
     assert {p.name for p in out.iterdir()} == {"index.html", "trace-check.json", "trace-check.svg", "trace-check.png"}
 

@@ -13,6 +13,7 @@ import pytest
 from bake_core.errors import MachineError
 from bake_core.shader_compiler import compile_glsl
 from bake_core.vulkan import Bindings, Device, Draw, color_target, compute_pipeline, depth_target, graphics_pipeline, storage, texture
+from tests.glsl import SWIFTSHADER
 
 DOUBLE = """#version 450
 layout(local_size_x = 64) in;
@@ -77,6 +78,13 @@ def test_an_image_or_a_buffer_larger_than_the_device_takes_is_refused() -> None:
     with Device() as device, pytest.raises(MachineError) as caught:
         storage(device, 1 << 40)
     assert caught.value.slug == "vulkan.buffer_too_large"
+
+
+@pytest.mark.skipif(not SWIFTSHADER.is_file(), reason="SwiftShader comes with Chromium; `make chromium` fetches it")
+def test_the_environment_names_another_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VK_DRIVER_FILES", str(SWIFTSHADER))
+    with Device() as device:
+        assert "SwiftShader" in device.name
 
 
 def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
