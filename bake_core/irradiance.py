@@ -39,14 +39,16 @@ class Samples:
     irradiance : (n, 3) float64
         E, no 1/π inside; everything but the direct light of punctual and directional lights.
     weights : (n, 8 k) float64
-        Of the probes around each point, eight for each of the volumes that answer, k being the most that do for any point. They sum to 1,
-        or to less where none of a volume's is active.
+        Of the probes around each point, eight for each of the volumes that answer, k being the most that do for any point. They sum
+        to 1, or are all 0 where no probe is active.
     probes : (n, 8 k) int64
         Flat indices of those probes within their volumes. Corner c is the upper one along x, y, z where its bits 0, 1, 2 are set.
     volumes : (n, 8 k) int64
         Indices of their volumes.
     volume : (n,) int64
         Index of the finest volume around each point; of the nearest one where none is.
+    shares : (volumes, n) float64
+        How much each volume's answer counts; they sum to 1, or are all 0.
     """
 
     irradiance: F64
@@ -54,6 +56,7 @@ class Samples:
     probes: I64
     volumes: I64
     volume: I64
+    shares: F64
 
 
 def sample(
@@ -77,41 +80,51 @@ def sample(
     positions = np.asarray(positions, np.float64).reshape(-1, 3)
     normals = np.asarray(normals, np.float64).reshape(-1, 3)
     wo, toward = (normals if d is None else np.asarray(d, np.float64).reshape(-1, 3) for d in (wo, toward))
-    n, chosen, shares = len(positions), select_volume(volumes, positions), volume_shares(volumes, positions)
+    n, chosen, reach = len(positions), select_volume(volumes, positions), _reach(volumes, positions)
     # One at least: there may be no points.
-    k = int((shares > 0).sum(0).max(initial=1))
+    k = int((reach > 0).sum(0).max(initial=1))
     weights, probes, owners = np.zeros((n, k, 8)), np.zeros((n, k, 8), np.int64), np.repeat(chosen, 8 * k).reshape(n, k, 8)
-    irradiance, slot = np.zeros((n, 3)), np.zeros(n, np.int64)
+    irradiance, slot, rest, shares = np.zeros((n, 3)), np.zeros(n, np.int64), np.ones(n), np.zeros(reach.shape)
     for v in finest_first(volumes):
         volume = volumes[v]
         table = probe_texels(volume).reshape(-1, 4).astype(np.float64)
-        of_volume = np.flatnonzero(shares[v] > 0)
+        of_volume = np.flatnonzero(rest * reach[v] > 0)
         for first in range(0, len(of_volume), CHUNK):
             at = of_volume[first : first + CHUNK]
             light, part, around = _in_volume(volume, table, positions[at], normals[at], wo[at], toward[at])
-            irradiance[at] += shares[v, at, None] * light
-            weights[at, slot[at]], probes[at, slot[at]], owners[at, slot[at]] = shares[v, at, None] * part, around, v
-        slot[of_volume] += 1
-    return Samples(irradiance, weights.reshape(n, 8 * k), probes.reshape(n, 8 * k), owners.reshape(n, 8 * k), chosen)
+            answers = part.any(-1)
+            share = rest[at] * reach[v, at] * answers
+            rest[at] *= 1 - reach[v, at] * answers
+            shares[v, at] = share
+            irradiance[at] += share[:, None] * light
+            weights[at, slot[at]], probes[at, slot[at]], owners[at, slot[at]] = share[:, None] * part, around, v
+            # What has no answer leaves its place to the next.
+            slot[at] += answers
+    k = int(slot.max(initial=1))
+    total = np.where(shares.any(0), shares.sum(0), 1)
+    return Samples(
+        irradiance / total[:, None],
+        (weights[:, :k] / total[:, None, None]).reshape(n, 8 * k),
+        probes[:, :k].reshape(n, 8 * k),
+        owners[:, :k].reshape(n, 8 * k),
+        chosen,
+        shares / total,
+    )
 
 
-def volume_shares(volumes: Sequence[VolumeData], positions: F64) -> F64:
-    """How much each volume's answer counts at each point, (volumes, n) float64; they sum to 1. Mirrors the loop of ``obIrradianceToward``.
+def _reach(volumes: Sequence[VolumeData], positions: F64) -> F64:
+    """How far each volume reaches each point, (volumes, n) float64, from 0 to 1. Mirrors the loop of ``obIrradianceToward``.
 
     A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the
     rest to the next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest
-    has.
+    has. One whose probes about the point are all inside geometry has no answer, and leaves all of it to the next.
     """
-    shares, rest = np.zeros((len(volumes), len(positions))), np.ones(len(positions))
     nearest = select_volume(volumes, positions)
-    for v in finest_first(volumes):
-        volume = volumes[v]
+    out = np.empty((len(volumes), len(positions)))
+    for v, volume in enumerate(volumes):
         beyond = (_beyond(volume, positions) / (0.5 * volume.spacing)).max(-1)
         # So little for the nearest counts only where it is alone.
-        reach = np.maximum(1 - np.minimum(beyond, 1), np.where(nearest == v, 1e-20, 0))
-        shares[v] = rest * reach
-        rest = rest * (1 - reach)
-    out: F64 = shares / shares.sum(0)
+        out[v] = np.maximum(1 - np.minimum(beyond, 1), np.where(nearest == v, 1e-20, 0))
     return out
 
 

@@ -43,7 +43,8 @@ float obCrush(float weight) {
 
 // Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
 // (facing times visibility, crushed); probes inside geometry have no tile and no weight. They are the surface's, whichever way is asked.
-vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 toward) {
+// w is 1, or 0 where none of the eight has a tile.
+vec4 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 toward) {
     ObVolume volume = obVolume(v);
     ObCell cell = obCell(volume, position);
     vec3 biased = position + normal * volume.normalBias + wo * volume.viewBias;
@@ -69,7 +70,7 @@ vec3 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 towar
     }
     // Nothing in the first sum: the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.
     vec4 chosen = sum.w > 0.0 ? sum : rest;
-    return chosen.w > 0.0 ? chosen.xyz / chosen.w : vec3(0.0);
+    return chosen.w > 0.0 ? vec4(chosen.xyz / chosen.w, 1.0) : vec4(0.0);
 }
 
 // The finest volume that contains a point; the nearest one where none does.
@@ -95,7 +96,8 @@ int obSelectVolume(vec3 position) {
 //   wo        unit, from the point to the viewer; the normal itself where there is none
 //   toward    unit, the way that the plane faces on which light arrives: the normal, but for lobes that are not about it
 // A volume reaches all of its box, and over half a spacing beyond it less and less. The finest one has what it reaches, and leaves the rest to the
-// next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest has.
+// next: a fine volume inside a coarse one fades into it, and neighbours fade into each other. What none reaches, the nearest has. One whose probes
+// about the point are all inside geometry has no answer, and leaves all of it to the next.
 vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
     int nearest = obSelectVolume(position);
     vec4 sum = vec4(0.0);
@@ -107,14 +109,15 @@ vec3 obIrradianceToward(vec3 position, vec3 normal, vec3 wo, vec3 toward) {
         // So little for the nearest counts only where it is alone.
         float reach = max(1.0 - min(max(beyond.x, max(beyond.y, beyond.z)), 1.0), v == nearest ? 1e-20 : 0.0);
         if (reach > 0.0) {
-            sum += rest * reach * vec4(obIrradianceInVolume(v, position, normal, wo, toward), 1.0);
-            rest *= 1.0 - reach;
+            vec4 found = obIrradianceInVolume(v, position, normal, wo, toward);
+            sum += rest * reach * found;
+            rest *= 1.0 - reach * found.w;
         }
         if (rest == 0.0) {
             break;
         }
     }
-    return sum.xyz / sum.w;
+    return sum.w > 0.0 ? sum.xyz / sum.w : vec3(0.0);
 }
 
 vec3 obIrradiance(vec3 position, vec3 normal, vec3 wo) {

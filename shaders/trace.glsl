@@ -413,7 +413,7 @@ ObTrace obTraceRadiance(vec3 position, vec3 direction, float roughness) {
     ObTrace trace = obTrace(position, direction);
     if (trace.volume < 0) {
         int v = obSelectVolume(position);
-        trace.radiance = obIrradianceInVolume(v, position, direction, direction, direction) / 3.14159265;
+        trace.radiance = obIrradianceInVolume(v, position, direction, direction, direction).xyz / 3.14159265;
         return trace;
     }
     ObVolume volume = obVolume(trace.volume);

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     from bake_core.bundle import read_bundle
     from bake_core.errors import InputError
-    from bake_core.irradiance import sample, volume_shares
+    from bake_core.irradiance import sample
 
     if len(args.at) != len(args.normal):
         raise InputError("sample.usage", f"{len(args.at)} --at and {len(args.normal)} --normal: give one normal for each point", "--normal")
@@ -51,11 +51,11 @@ def run(args: argparse.Namespace) -> int:
     volumes = read_bundle(args.bundle).volumes
     if "irradiance" not in volumes[0].atlases:
         raise InputError("sample.no_irradiance", "the bundle holds no irradiance; bake it with that output", str(args.bundle))
-    answer, shares = sample(volumes, positions, normals / lengths), volume_shares(volumes, positions)
+    answer = sample(volumes, positions, normals / lengths)
     samples: list[dict[str, Any]] = []
     for i, (position, normal) in enumerate(points):
         # Eight probes for each volume that answers, the finest first; what is behind them is for points that more volumes answer for.
-        count = int((shares[:, i] > 0).sum())
+        count = max(1, int((answer.shares[:, i] > 0).sum()))
         answering = answer.volumes[i, : 8 * count : 8]
         samples.append(
             {
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
                 "normal": list(normal),
                 "irradiance": answer.irradiance[i].tolist(),
                 "volume": volumes[answer.volume[i]].name,
-                "volumes": [{"name": volumes[v].name, "weight": float(shares[v, i])} for v in answering],
+                "volumes": [{"name": volumes[v].name, "weight": float(answer.shares[v, i])} for v in answering],
                 "probes": answer.probes[i, : 8 * count].tolist(),
                 "weights": answer.weights[i, : 8 * count].tolist(),
             }

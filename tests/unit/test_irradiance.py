@@ -126,6 +126,18 @@ def test_a_fine_volume_fades_into_the_coarse_one_around_it() -> None:
         assert set(found.volume) == {0, 1}
 
 
+def test_a_volume_with_no_probe_about_a_point_leaves_it_to_the_next() -> None:
+    """All of the fine one's probes are inside geometry: the coarse one has the whole answer, wherever the fine one fades."""
+    coarse = filled(in_the_open((5, 5, 5)), "irradiance", np.array(1.0))
+    fine = synthetic.volume("fine", (1, 1, 1), (0.5, 0.5, 0.5), (3, 3, 3), seed=1, inactive=tuple(range(27)))
+    x = np.linspace(0, 4, 41)
+    positions = np.stack([x, np.full(41, 1.5), np.full(41, 1.5)], -1)
+    found = irradiance.sample((coarse, fine), positions, np.tile([0.0, 1.0, 0.0], (41, 1)))
+    np.testing.assert_allclose(found.irradiance, 1, rtol=1e-15)
+    assert found.weights.shape == (41, 8)
+    assert not found.volumes.any()
+
+
 def test_neighbours_fade_into_each_other_and_the_nearest_answers_beyond_both() -> None:
     """Two volumes side by side: the first has its own box, the second's half a spacing beyond it changes hands without a step."""
     a = filled(in_the_open((3, 3, 3)), "irradiance", np.array(1.0))

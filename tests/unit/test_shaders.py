@@ -105,6 +105,20 @@ def test_one_volume_is_enough(host: Host) -> None:
     np.testing.assert_allclose(found[:, :3], expected.irradiance, atol=4e-5)
 
 
+def test_a_volume_with_no_probe_about_a_point_leaves_it_to_the_next(host: Host) -> None:
+    coarse = synthetic.volume("coarse", (0, 0, 0), (1, 1, 1), (4, 4, 4), seed=1)
+    dead = synthetic.volume("dead", (1, 1, 1), (0.5, 0.5, 0.5), (3, 3, 3), seed=2, inactive=tuple(range(18)))
+    positions = np.stack([synthetic.sequence(1000, k * 1000) for k in range(3)], -1) * 3
+    normals = np.tile([0.36, 0.48, 0.8], (1000, 1))
+    found = host(QUERY, [positions, normals, normals], 2, (coarse, dead))[:, 0, :3]
+    expected = irradiance.sample((coarse, dead), positions, normals)
+    assert np.abs(found - expected.irradiance).max() < 5e-6 * float(coarse.atlases["irradiance"].texels.max())
+    without = irradiance.sample((coarse,), positions, normals).irradiance
+    left = (expected.shares[1] == 0) & ((positions > 1) & (positions < 1.5)).all(-1)
+    assert left.any()
+    np.testing.assert_allclose(expected.irradiance[left], without[left], rtol=1e-14)
+
+
 def test_as_many_volumes_as_a_spec_may_have(host: Host) -> None:
     """Sixty-four, of different sizes, in a row."""
     volumes = tuple(synthetic.volume(f"v{i}", (2.0 * i, 0, 0), (1, 1, 1), (2, 2 + i % 3, 1 + i % 2), seed=i) for i in range(64))
