@@ -47,11 +47,11 @@ FADES = (0.01, 0.03, 0.1)
 # The farthest that any choice moves a point.
 LARGEST = {**PARAMETERS, "normal_bias": max(BIASES)}
 
-# Points of a volume, and paths from each for each of four estimates: few points would miss small rooms.
+# Points, shared out between volumes, and paths from each for each of four estimates: few points would miss small rooms.
 _POINTS, _SCRAMBLES, _PATHS = 2048, 4, 16
 _SEED = 0x9A7A3E
-# Fewer points than this tell nothing.
-_FEWEST = 64
+# Of a volume among many; and how many must be found at least, for fewer tell nothing.
+_LEAST, _FEWEST = 256, 64
 # Dark is what receives less than this part of the volume's mean.
 _DARK = 0.01
 # Standard errors of a difference by which a choice must be better.
@@ -110,7 +110,8 @@ def choose_parameters(scene: Scene, tracer: Tracer, volumes: Sequence[VolumeData
         The same for any number of threads.
     """
     asked = {"irradiance", "walls"}
-    return [_choose(scene, tracer, v, threads) if asked <= set(v.atlases) else Choice(PARAMETERS) for v in volumes]
+    points = max(_POINTS // max(len(volumes), 1), _LEAST)
+    return [_choose(scene, tracer, v, points, threads) if asked <= set(v.atlases) else Choice(PARAMETERS) for v in volumes]
 
 
 def compile_choice(scene: Scene, tracer: Tracer) -> None:
@@ -120,8 +121,8 @@ def compile_choice(scene: Scene, tracer: Tracer) -> None:
     irradiance_at(tracer, np.zeros((1, 10)), samples=0, scrambles=1, seed=0)
 
 
-def _choose(scene: Scene, tracer: Tracer, volume: VolumeData, threads: int) -> Choice:
-    receivers = draw_receivers(scene, tracer, (volume,), _POINTS, _SEED)
+def _choose(scene: Scene, tracer: Tracer, volume: VolumeData, points: int, threads: int) -> Choice:
+    receivers = draw_receivers(scene, tracer, (volume,), points, _SEED)
     n = len(receivers)
     if n < _FEWEST:
         return Choice(PARAMETERS)
@@ -138,8 +139,9 @@ def _choose(scene: Scene, tracer: Tracer, volume: VolumeData, threads: int) -> C
     def light_in_the_dark(answers: F64) -> float:
         return float(np.linalg.norm(answers[dark], axis=-1).mean()) if dark.any() else 0.0
 
-    best = _Tried(PARAMETERS, relative_squares(ask(PARAMETERS), estimates, bounded=True))
-    before, darkest = best.squares, light_in_the_dark(ask(PARAMETERS))
+    default = ask(PARAMETERS)
+    best = _Tried(PARAMETERS, relative_squares(default, estimates, bounded=True))
+    before, darkest = best.squares, light_in_the_dark(default)
     # What a probe counts for that does not see the point, and where from that is asked; then how gradually, which matters least.
     for names, values in (
         (("normal_bias", "visibility_floor"), itertools.product(BIASES, FLOORS)),

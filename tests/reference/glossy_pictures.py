@@ -22,7 +22,7 @@ def main() -> int:
     octobake = str(Path(sys.executable).with_name("octobake"))
     for name, (roughness, color) in METALS.items():
         glb, spec = glossy_cornell(roughness, color)
-        spec["stop"] = {"target_error": None, "max_samples": 24}
+        spec["stop"] = {"target_error": None, "max_samples": 64}
         with tempfile.TemporaryDirectory() as folder:
             work = Path(folder)
             (work / "scene.glb").write_bytes(glb)
