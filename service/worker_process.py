@@ -11,6 +11,9 @@ import signal
 import sys
 import threading
 
+# A bake takes every core; without this a request, and the commit of a shard, would wait for its turn on one as long as any of its threads.
+NICENESS = 5
+
 
 def main(scheduler: str, folder: str) -> None:
     """Work for the scheduler at this address until the service goes away, be it while modules are still read."""
@@ -19,6 +22,7 @@ def main(scheduler: str, folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_service, daemon=True).start()
+    os.nice(NICENESS)
 
     from service import worker as tasks
     from service.dask_configuration import configure
