@@ -34,6 +34,8 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT."""
+    # Looking for garbage among what is imported is a tenth of a start. From when it listens on there may be some.
+    gc.disable()
     # Now, not above: `octobake --help` waits for none of it.
     import uvicorn
 
@@ -50,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
                 # Of all that is imported by now nothing will ever be garbage, and a look at it all (0.2 s) holds up every request.
                 gc.collect()
                 gc.freeze()
+                gc.enable()
                 print(f"listening on {url}", flush=True)
                 if args.ready_file:
                     _write_whole(args.ready_file, url + "\n")
