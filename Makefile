@@ -4,7 +4,7 @@ BIN := .venv/bin
 LOCKS := requirements.txt requirements-dev.txt
 PROJECTS := pyproject.toml clients/python/pyproject.toml
 
-.PHONY: help setup system-packages demo check test test-slow test-drivers chromium chaos service-figures image-test lock clean
+.PHONY: help setup system-packages demo check test test-slow test-drivers chromium chaos fuzz service-figures image-test lock clean
 .DELETE_ON_ERROR:
 
 help:
@@ -15,7 +15,8 @@ help:
 	@echo "make chromium    headless Chromium in build/, where tests find a second Vulkan driver and a WebGL2 (Debian; nothing is installed)"
 	@echo "make test-drivers   setup, chromium; then the GLSL module on lavapipe, on SwiftShader and on WebGL2"
 	@echo "make chaos       setup; then 1,000 random kills of a service and its worker, about an hour (ARGS=\"--kills N --seed S\")"
-	@echo "make service-figures   setup; then what the service holds under load, two minutes on a quiet machine"
+	@echo "make fuzz        setup; then coverage-guided fuzzing of the scene reader, five minutes (ARGS=\"--seconds N --seed S\"); Linux, x86-64"
+	@echo "make service-figures   setup; then what the service holds under load, two minutes on a quiet machine (ARGS=all: every goal, about an hour)"
 	@echo "make image-test  build docker/Dockerfile with buildah (root, Debian), start it, bake and verify through it"
 	@echo "make check       setup; then lint, format, types, import layers, shaders for both targets"
 	@echo "make lock        choose package versions anew, and write them with their hashes to $(LOCKS)"
@@ -55,6 +56,9 @@ build/chromium:
 
 chaos: setup
 	$(BIN)/python -m tests.service.chaos $(ARGS)
+
+fuzz: setup
+	nice -n 19 $(BIN)/python -m tests.faults.fuzz $(ARGS)
 
 service-figures: setup
 	$(BIN)/python -m tests.service.figures $(ARGS)

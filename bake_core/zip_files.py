@@ -53,7 +53,8 @@ def unpack(path: Path, folder: Path, name: str | None = None) -> tuple[str, dict
     name = name or path.name
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = [e for e in archive.infolist() if not e.is_dir()]
+            # Not is_dir(), which looks at the last character of a name that may have none.
+            entries = [e for e in archive.infolist() if not e.filename.endswith("/")]
             _check(entries, path.stat().st_size, name)
             roots = [e.filename for e in entries if PurePosixPath(e.filename).suffix.lower() in _ROOTS and not _is_metadata(e.filename)]
             if len(roots) != 1:

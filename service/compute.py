@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -34,6 +35,8 @@ CLOSE_SECONDS = 0.5
 SLOTS_SECONDS = 0.5
 # A worker that ends sooner than this cannot even start: do not try again at once.
 QUICK_DEATH_SECONDS = 1.0
+# A worker has begun its work by then, and is not held up while another is started beside it.
+SPARE_SECONDS = 4.0
 # What a worker tells: {"key", "address", "began": true} … {"key", "done": 0.3} … {"key", "ended": true}.
 Message: TypeAlias = dict[str, Any]
 
@@ -120,16 +123,17 @@ class Compute:
 
 
 class _EmbeddedWorker:
-    """A worker process, started again whenever it ends.
+    """A worker process, replaced whenever it ends; while it works another waits with everything imported, for that takes seconds.
 
     Not Dask's nanny, which gives up on a worker that dies while it starts.
     """
 
     def __init__(self, scheduler: str, folder: Path) -> None:
-        self._command = [sys.executable, "-m", "service.worker_process", scheduler, str(folder)]
+        self._command = [sys.executable, "-m", "service.worker_process", scheduler]
         self._folder = folder
         self._closing = threading.Event()
-        self._process = self._start()
+        self._spare: subprocess.Popen[bytes] | None = None
+        self._process = self._take()
         self._thread = threading.Thread(target=self._watch, name="octobake-worker", daemon=True)
         self._thread.start()
 
@@ -138,29 +142,53 @@ class _EmbeddedWorker:
         self._process.kill()
 
     def close(self) -> None:
-        """End the process for good."""
+        """End the processes for good."""
         self._closing.set()
         self.kill()
         self._thread.join(CLOSE_SECONDS)
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # What the one before was making when it died.
-        shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True, exist_ok=True)
-        # Its standard input is how it learns that this process has gone.
-        return subprocess.Popen(self._command, stdin=subprocess.PIPE, env={**os.environ, "TMPDIR": str(self._folder)})
+        folder = tempfile.mkdtemp(dir=self._folder)
+        # Its standard input is how it learns that it is to work, and that this process has gone.
+        return subprocess.Popen([*self._command, folder], stdin=subprocess.PIPE, env={**os.environ, "TMPDIR": folder})
+
+    def _take(self) -> subprocess.Popen[bytes]:
+        """Let the one that waits work, or a new one where none does."""
+        process, self._spare = self._spare or self._start(), None
+        assert process.stdin is not None
+        # One that has died while it waited is seen to be dead by whoever waits for its end.
+        with suppress(BrokenPipeError):
+            process.stdin.write(b"work\n")
+            process.stdin.flush()
+        return process
 
     def _watch(self) -> None:
         while not self._closing.is_set():
             began = time.monotonic()
-            code = self._process.wait()
+            code = self._end_of_process()
             if self._closing.is_set():
-                return
+                break
             log.warning("the worker has ended (%d); starting another", code)
             if time.monotonic() - began < QUICK_DEATH_SECONDS:
                 self._closing.wait(QUICK_DEATH_SECONDS)
-            with self._process:
-                pass  # close our end of its standard input
-            self._process = self._start()
-            if self._closing.is_set():
-                self.kill()
+            _discard(self._process)
+            self._process = self._take()
+        for process in (self._process, self._spare):
+            if process is not None:
+                process.kill()
+
+    def _end_of_process(self) -> int:
+        try:
+            return self._process.wait(SPARE_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._spare = self._start()
+            # This may have been closed in between.
+            return self._process.wait()
+
+
+def _discard(process: subprocess.Popen[bytes]) -> None:
+    """Close our end of an ended process's standard input, and remove what it was making when it died."""
+    with suppress(BrokenPipeError), process:
+        pass
+    shutil.rmtree(str(process.args[-1]), ignore_errors=True)  # type: ignore[index]

@@ -10,6 +10,8 @@ import dask
 _CONFIGURATION: dict[str, Any] = {
     # A lost worker is counted in our store, per piece of work; Dask would blame the tasks that were merely queued behind it.
     "distributed.scheduler.allowed-failures": 0,
+    # Counted by the wall clock, which jumps: a machine that wakes would lose its worker. We watch the process itself.
+    "distributed.scheduler.worker-ttl": None,
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
     # Its sampling profiler walks the stacks of our kernels' threads for pages that nobody serves.

@@ -1,15 +1,21 @@
 """``python -m service.worker_process SCHEDULER FOLDER``: the embedded worker, started and watched by :mod:`service.compute`.
 
+It imports everything, and works once a line comes by its standard input.
+
 A worker of somebody's own cluster is Dask's own: ``dask worker --nthreads 1 --preload service.worker SCHEDULER``.
 """
 
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import sys
 import threading
+
+# A bake takes every core; without this a request, and the commit of a shard, would wait for its turn on one as long as any of its threads.
+NICENESS = 5
 
 
 def main(scheduler: str, folder: str) -> None:
@@ -18,19 +24,28 @@ def main(scheduler: str, folder: str) -> None:
     # went by itself would be taken for lost.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_service, daemon=True).start()
+    called = threading.Event()
+    threading.Thread(target=_hear_the_service, args=(called,), daemon=True).start()
+    os.nice(NICENESS)
 
+    # Looking for garbage among what is imported is a tenth of a start.
+    gc.disable()
     from service import worker as tasks
     from service.dask_configuration import configure
 
     # Imported here although the scheduler would name it: the first task does not wait for it.
     assert tasks
     configure()
+    gc.freeze()
+    gc.enable()
+    called.wait()
     asyncio.run(_work(scheduler, folder))
 
 
-def _end_with_the_service() -> None:
+def _hear_the_service(called: threading.Event) -> None:
     """Go when the service has gone, however it went: its end of our standard input closes with it, even on kill -9."""
+    if sys.stdin.buffer.readline():
+        called.set()
     sys.stdin.buffer.read()
     os._exit(0)
 

@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 import psutil
 from fastapi import FastAPI
-from octobake_client import Client
+from octobake_client import Bake, Client
 
 from bake_core.examples import closed_box
 
@@ -123,8 +123,12 @@ class Server:
         return children
 
     def bake_worker(self) -> psutil.Process:
-        """The process that bakes; waits for it where it is just being started again."""
-        worker: psutil.Process = wait_for(lambda: next(filter(_bakes, self.workers()), None), START_SECONDS)
+        """The process that bakes; waits for it where it is just being started again. A younger one waits for its end."""
+
+        def oldest() -> psutil.Process | None:
+            return min(filter(_bakes, self.workers()), key=lambda process: process.create_time(), default=None)
+
+        worker: psutil.Process = wait_for(oldest, START_SECONDS)
         return worker
 
     def kill(self) -> None:
@@ -175,6 +179,31 @@ def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
         assert time.monotonic() < deadline, f"waited {seconds} s in vain"
         time.sleep(0.01)
     return answer
+
+
+def busy(processes: list[psutil.Process], seconds: float) -> float:
+    """CPU seconds that processes use in so many seconds."""
+
+    def used() -> float:
+        return sum(sum(p.cpu_times()[:2]) for p in processes if p.is_running())
+
+    before = used()
+    time.sleep(seconds)
+    return used() - before
+
+
+def cancel_to_idle(server: Server, client: Client, job: Bake) -> float:
+    """Seconds from asking until no process that worked uses a CPU any more; the job is cancelled then, and its work swept away."""
+    workers = server.workers()
+    began = time.monotonic()
+    assert client.cancel(job).state in ("cancelling", "cancelled")
+    idle = time.monotonic()
+    while time.monotonic() - idle < 0.3:
+        if busy(workers, 0.05) > 0.02:
+            idle = time.monotonic()
+    assert client.wait(job).state == "cancelled"
+    assert not (server.data / "blobs" / "work" / job.id).exists()
+    return idle - began
 
 
 def box_spec(samples: int = 16, probes: tuple[int, int, int] = (2, 2, 2), **more: Any) -> dict[str, Any]:

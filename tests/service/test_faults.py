@@ -26,7 +26,7 @@ import pytest
 from octobake_client import Bake, Client
 
 from tests.pavilion import SKY, pavilion_spec, write_pavilion
-from tests.service.running import Server, box_spec, environment, free_port, living, octobake, wait_for
+from tests.service.running import Server, box_spec, busy, cancel_to_idle, environment, free_port, living, octobake, wait_for
 
 # Some 5 s of work for two cores, half of it in the last pass: long enough to be interrupted in the middle.
 SAMPLES = 256
@@ -77,31 +77,6 @@ def until_the_last_pass(client: Client, job: Bake) -> Bake:
             break
     time.sleep(0.5)
     return client.bake(job.id)
-
-
-def busy(processes: list[psutil.Process], seconds: float) -> float:
-    """CPU seconds that processes use in so many seconds."""
-
-    def used() -> float:
-        return sum(sum(p.cpu_times()[:2]) for p in processes if p.is_running())
-
-    before = used()
-    time.sleep(seconds)
-    return used() - before
-
-
-def cancel_to_idle(server: Server, client: Client, job: Bake) -> float:
-    """Seconds from asking until no process that worked uses a CPU any more; the job is cancelled then, and its work swept away."""
-    workers = server.workers()
-    began = time.monotonic()
-    assert client.cancel(job).state in ("cancelling", "cancelled")
-    idle = time.monotonic()
-    while time.monotonic() - idle < 0.3:
-        if busy(workers, 0.05) > 0.02:
-            idle = time.monotonic()
-    assert client.wait(job).state == "cancelled"
-    assert not (server.data / "blobs" / "work" / job.id).exists()
-    return idle - began
 
 
 def test_a_cancel_frees_the_cpu_within_a_second(server: Server, box: Path, scene: Path) -> None:

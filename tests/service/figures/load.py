@@ -1,52 +1,27 @@
-"""What the service holds under load, measured: ``make service-figures`` prints a line for each goal of docs/operations.md.
-
-Times are of the machine it runs on, and of whatever else that machine does meanwhile.
-"""
+"""Under load: latencies while baking, many listeners, a shutdown under them, a start with many jobs."""
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import secrets
 import sqlite3
-import sys
-import tempfile
 import time
-from collections.abc import Callable
 from contextlib import closing, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import psutil
 
-from bake_core.examples import closed_box
+from tests.service.figures.table import Say
+from tests.service.figures.work import ENDLESS, submit, until_running
 from tests.service.running import Server, box_spec, wait_for
 
 REQUESTS_PER_SECOND = 50
 LISTENERS = 500
 JOBS = 10_000
-# Never done by itself.
-ENDLESS = box_spec(samples=1_000_000, probes=(8, 8, 8))
-Say = Callable[[str, float, float, str], None]
-
-
-def submit(server: Server, spec: dict[str, Any]) -> str:
-    """Queue a bake of the box; answers its id."""
-    glb, _ = closed_box(0.5, 1.0)
-    headers = {"Content-Type": "model/gltf-binary"}
-    scene = httpx.post(f"{server.url}/v1/scenes", content=glb, headers=headers, timeout=60).json()["digest"]
-    answer = httpx.post(f"{server.url}/v1/bakes", json={"scene": scene, "spec": spec}, timeout=60)
-    job: str = answer.json()["id"]
-    return job
-
-
-def until_running(server: Server, job: str) -> None:
-    """Wait until a job is traced."""
-    wait_for(lambda: httpx.get(f"{server.url}/v1/bakes/{job}").json()["state"] == "running", 120)
 
 
 async def requests_while_baking(server: Server, job: str, seconds: float) -> dict[str, list[float]]:
@@ -117,7 +92,7 @@ def multiply(database: Path, job: str, count: int) -> None:
 
 
 def measure(folder: Path, seconds: float, say: Say) -> None:
-    """Measure everything in turn."""
+    """Measure it in turn."""
     server = Server(folder / "data")
     try:
         server.wait_ready()
@@ -146,24 +121,3 @@ def measure(folder: Path, seconds: float, say: Say) -> None:
         say("write-ahead log after all this", wal.stat().st_size / 2**20, 64.0, "MB")
     finally:
         server.close()
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=30.0, help="of requests, and of listening")
-    args = parser.parse_args()
-    print(f"{'property':<58}{'measured':>12}{'goal':>12}")
-    missed = 0
-
-    def say(what: str, value: float, goal: float, unit: str) -> None:
-        nonlocal missed
-        missed += value > goal
-        print(f"{what:<58}{value:>9.3f} {unit:<2}{goal:>9g} {unit:<2}", flush=True)
-
-    with tempfile.TemporaryDirectory(prefix="octobake-figures-") as folder:
-        measure(Path(folder), args.seconds, say)
-    return 1 if missed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

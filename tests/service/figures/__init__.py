@@ -1,0 +1,1 @@
+"""What the service holds, measured: ``make service-figures``."""
