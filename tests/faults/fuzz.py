@@ -6,6 +6,7 @@ The first byte of an input chooses what kind of file the rest is. A finding is w
 from __future__ import annotations
 
 import argparse
+import os
 import struct
 import sys
 import tempfile
@@ -77,8 +78,15 @@ def main() -> None:
             "print_final_stats": 1,
             "artifact_prefix": f"{args.findings}/",
         }
-        atheris.Setup([sys.argv[0], *(f"-{key}={value}" for key, value in options.items()), str(given)], lambda data: read(data, folder))
-        atheris.Fuzz()
+        # libFuzzer ends its process at once, and would leave the folder behind.
+        child = os.fork()
+        if not child:
+            atheris.Setup(
+                [sys.argv[0], *(f"-{key}={value}" for key, value in options.items()), str(given)], lambda data: read(data, folder)
+            )
+            atheris.Fuzz()
+        _, status = os.waitpid(child, 0)
+    raise SystemExit(os.waitstatus_to_exitcode(status))
 
 
 if __name__ == "__main__":
