@@ -33,8 +33,9 @@ def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"description": _TEXTS[status], "content": content} for status in statuses}
 
 
-def the_service(request: Request) -> Service:
+async def the_service(request: Request) -> Service:
     """The service that this application speaks for."""
+    # A coroutine although it waits for nothing: the framework would call a function in another thread, for every request.
     service: Service = request.app.state.service
     return service
 

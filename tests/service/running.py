@@ -28,9 +28,10 @@ BOX, _ = closed_box(0.5, 1.0)
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's environment, with the checkout importable."""
+    """This process's environment, with the checkout importable; bytecode is kept, as it is where the command is installed."""
     paths = [str(ROOT), str(ROOT / "clients" / "python"), os.environ.get("PYTHONPATH", "")]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **more}
+    ours = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**ours, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **more}
 
 
 def octobake(*arguments: str | Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
@@ -172,15 +173,6 @@ def living(processes: list[psutil.Process], seconds: float) -> list[psutil.Proce
         time.sleep(0.005)
 
 
-def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
-    """Poll until `condition` is true; answers what it answered."""
-    deadline = time.monotonic() + seconds
-    while not (answer := condition()):
-        assert time.monotonic() < deadline, f"waited {seconds} s in vain"
-        time.sleep(0.01)
-    return answer
-
-
 def busy(processes: list[psutil.Process], seconds: float) -> float:
     """CPU seconds that processes use in so many seconds."""
 
@@ -204,6 +196,15 @@ def cancel_to_idle(server: Server, client: Client, job: Bake) -> float:
     assert client.wait(job).state == "cancelled"
     assert not (server.data / "blobs" / "work" / job.id).exists()
     return idle - began
+
+
+def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
+    """Poll until `condition` is true; answers what it answered."""
+    deadline = time.monotonic() + seconds
+    while not (answer := condition()):
+        assert time.monotonic() < deadline, f"waited {seconds} s in vain"
+        time.sleep(0.01)
+    return answer
 
 
 def box_spec(samples: int = 16, probes: tuple[int, int, int] = (2, 2, 2), **more: Any) -> dict[str, Any]:
