@@ -171,6 +171,7 @@ def measure(
     threads: int,
     max_seconds: float,
     max_samples: int,
+    audit_seconds: float | None,
     say: Callable[[str], None],
 ) -> Targets:
     """Bake every scene to every target, the easiest first.
@@ -179,6 +180,8 @@ def measure(
     ----------
     max_seconds, max_samples
         Each bake ends there at the latest.
+    audit_seconds
+        What each audit may take; None: 3 % of its bake, which resolves little where the bake took a second.
     say : callable
         Told a line after each bake.
     """
@@ -188,7 +191,7 @@ def measure(
             warm_up(subject, threads, Path(folder))
             for target in sorted(targets, reverse=True):
                 stop = Stop(target_error=target, max_seconds=max_seconds, max_samples=max_samples)
-                b = bake_to(subject, stop, threads, Path(folder))
+                b = bake_to(subject, stop, threads, Path(folder), audit_seconds=audit_seconds)
                 baked.append(b)
                 say(f"{b.scene}, target {target:g}: {b.samples} samples, error {percent(b.stated)}, {b.seconds:.1f} s, by {b.stopped}")
     return Targets(tuple(baked), max_seconds)

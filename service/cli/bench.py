@@ -46,6 +46,8 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     errors = kinds.add_parser("targets", parents=[shared], help="seconds, samples, stated and audited error of bakes to target errors")
     errors.add_argument("scenes", metavar="SCENE", nargs="*", type=Path, help=_SCENES)
     errors.add_argument("--targets", metavar="E,E,…", type=_numbers(float, 0), default=[0.05, 0.02, 0.01], help="default: 0.05,0.02,0.01")
+    few = "what each audit may take, beside the bake's seconds; 3 % of a bake of a second would resolve nothing; default: 10"
+    errors.add_argument("--audit-seconds", metavar="S", type=_number(float, 0), default=10.0, help=few)
 
     pairs = (
         kinds.add_parser("adaptive", parents=[shared], help="adaptive sampling against uniform, at equal error"),
@@ -127,7 +129,13 @@ def _measure(args: argparse.Namespace, subjects: list[Subject], say: Callable[[s
         )
     if args.kind == "targets":
         return targets.measure(
-            subjects, args.targets, threads=args.threads, max_seconds=args.max_seconds, max_samples=args.max_samples, say=say
+            subjects,
+            args.targets,
+            threads=args.threads,
+            max_seconds=args.max_seconds,
+            max_samples=args.max_samples,
+            audit_seconds=args.audit_seconds,
+            say=say,
         )
     stop = Stop(target_error=args.target, max_seconds=args.max_seconds, max_samples=args.max_samples)
     return pairs.measure(args.kind, subjects, threads=args.threads, stop=stop, runs=args.runs, say=say)
