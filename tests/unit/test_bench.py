@@ -87,7 +87,9 @@ def test_convergence_without_peers(scene: Path, capsys: pytest.CaptureFixture[st
 def test_targets(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = scene.parent / "page.md"
     page.write_text("# Mine\n\n<!-- bench targets -->\nold\n<!-- /bench targets -->\nafter\n")
-    out = bench("targets", scene, "--targets", "0.2,0.05", "--max-samples", "512", "--markdown", str(page), "--json")
+    out = bench(
+        "targets", scene, "--targets", "0.2,0.05", "--max-samples", "512", "--audit-seconds", "1", "--markdown", str(page), "--json"
+    )
     printed = json.loads(capsys.readouterr().out)
     document, rows = left(out, "targets")
     assert [(r["scene"], r["target"]) for r in rows] == [("plane", "0.2"), ("plane", "0.05")]
