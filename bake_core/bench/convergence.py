@@ -164,11 +164,12 @@ class _Ours:
 
 
 def _radiance(bundle: Bundle) -> F64:
-    """Every probe's tile, (p, side, side, 3)."""
+    """Every probe's tile, (p, side, side, 3); zero where one has none."""
     tiles = []
     for v in bundle.volumes:
-        a = v.atlases["radiance"]
-        tiles.append(unpack(a.texels, Layout(a.columns, a.rows, a.layers), len(v.states)).astype(np.float64))
+        a, active = v.atlases["radiance"], v.states == 1
+        tiles.append(np.zeros((len(active), a.interior, a.interior, 3)))
+        tiles[-1][active] = unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(active.sum()))
     return np.concatenate(tiles)
 
 

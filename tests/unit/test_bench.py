@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bake_core.bench import pairs, peers
-from bake_core.bench.convergence import EPSILON
+from bake_core.bench.convergence import EPSILON, _radiance
 from bake_core.bench.outcome import Series, error_against_seconds, put_section
 from bake_core.bench.targets import audited_in_words
 from bake_core.drawing import as_svg
@@ -23,6 +23,7 @@ from bake_core.rate import rate_of_runs
 from bake_core.scene_files import load_scene
 from bake_core.spec import parse_spec
 from service.cli import main
+from tests.baking import bake_example
 
 
 @pytest.fixture
@@ -121,6 +122,19 @@ def test_what_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> Non
     for arguments in (["--targets", "0"], ["--targets", "0.1,x"], ["--max-seconds", "inf"]):
         with pytest.raises(SystemExit):
             main(["bench", "targets", "-o", out, *arguments])
+
+
+def test_every_probe_has_its_own_tile(tmp_path: Path) -> None:
+    """Those inside solids have none in the bundle; what comes after them stays where it belongs."""
+    bundle = bake_example(tmp_path, cornell(), stop={"target_error": None, "max_samples": 1}, outputs=["radiance"])
+    (volume,), tiles = bundle.volumes, _radiance(bundle)
+    assert len(tiles) == len(volume.states) > (volume.states == 1).sum()
+    np.testing.assert_array_equal(tiles.reshape(len(tiles), -1).any(1), volume.states == 1)
+    last = np.flatnonzero(volume.states == 1)[-1]
+    tile, (row, column) = volume.atlases["radiance"].tile, np.divmod((volume.states == 1).sum() - 1, volume.atlases["radiance"].columns)
+    layer, row = np.divmod(row, volume.atlases["radiance"].rows)
+    stored = volume.atlases["radiance"].texels[layer, row * tile + 1 : (row + 1) * tile - 1, column * tile + 1 : (column + 1) * tile - 1]
+    np.testing.assert_array_equal(tiles[last], stored)
 
 
 def test_when_a_curve_gets_there() -> None:
