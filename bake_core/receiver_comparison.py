@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
 from bake_core.irradiance import sample
-from bake_core.receiver_irradiance import path_traced_irradiance
-from bake_core.receivers import Receivers, draw_receivers
+from bake_core.receiver_irradiance import irradiance_at
+from bake_core.receivers import Receivers, draw_receivers, stands_of
 from bake_core.relmse import RELMSE_FLOOR, relative_squares
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
@@ -132,9 +132,9 @@ def measure_receivers(
     Cancelled
     """
     receivers = draw_receivers(scene, tracer, volumes, COUNT, _SEED, cancelled=cancelled)
-    estimates = path_traced_irradiance(
+    estimates = irradiance_at(
         tracer,
-        receivers,
+        stands_of(tracer, receivers.places),
         samples=samples // _SCRAMBLES,
         scrambles=_SCRAMBLES,
         seed=_SEED,

@@ -21,7 +21,6 @@ from bake_core.errors import Cancelled
 from bake_core.kernels import entry_kernel
 from bake_core.materials import INV_PI, lambert_cosine, no_gloss, sample_lambert
 from bake_core.next_event import from_emitters, from_sky
-from bake_core.receivers import Receivers, stands_of
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.tracer import Tracer
 from bake_core.transport import trace_path
@@ -34,9 +33,9 @@ CANCELLED, DONE = 1, 0
 _CHUNK = 32
 
 
-def path_traced_irradiance(
+def irradiance_at(
     tracer: Tracer,
-    receivers: Receivers,
+    stands: F64,
     *,
     samples: int,
     scrambles: int,
@@ -45,12 +44,15 @@ def path_traced_irradiance(
     advance: Callable[[float], None] | None = None,
     cancelled: NDArray[np.uint8] | None = None,
 ) -> F64:
-    """Irradiance at receivers by path tracing, to the spec's `max_bounces`; the same bits for any number of threads.
+    """Irradiance at points by path tracing, to the spec's `max_bounces`; the same bits for any number of threads.
 
     Parameters
     ----------
+    stands : (n, 10) float64
+        Local frame: point, geometric and shading normal, and how far to leave the surface (0 in the open, where both normals are one). Of
+        receivers: ``stands_of(tracer, receivers.places)``.
     samples : int
-        Paths from each receiver for each estimate.
+        Paths from each point for each estimate.
     scrambles : int
         Independent estimates: their mean is the result, their spread its standard error.
     advance : callable, optional
@@ -67,30 +69,6 @@ def path_traced_irradiance(
     Raises
     ------
     Cancelled
-    """
-    stands = stands_of(tracer, receivers.places)
-    return irradiance_at(
-        tracer, stands, samples=samples, scrambles=scrambles, seed=seed, threads=threads, advance=advance, cancelled=cancelled
-    )
-
-
-def irradiance_at(
-    tracer: Tracer,
-    stands: F64,
-    *,
-    samples: int,
-    scrambles: int,
-    seed: int,
-    threads: int = 1,
-    advance: Callable[[float], None] | None = None,
-    cancelled: NDArray[np.uint8] | None = None,
-) -> F64:
-    """As :func:`path_traced_irradiance`, at any points.
-
-    Parameters
-    ----------
-    stands : (n, 10) float64
-        Local frame: point, geometric and shading normal, and how far to leave the surface (0 in the open, where both normals are one).
     """
     return estimate(
         _irradiance_kernel,

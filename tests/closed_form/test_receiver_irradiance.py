@@ -15,8 +15,8 @@ from bake_core.errors import Cancelled
 from bake_core.examples import closed_box, plane_under_sun, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.receiver_comparison import compare_receivers, measure_receivers
-from bake_core.receiver_irradiance import path_traced_irradiance
-from bake_core.receivers import Receivers, draw_receivers
+from bake_core.receiver_irradiance import irradiance_at
+from bake_core.receivers import Receivers, draw_receivers, stands_of
 from bake_core.scene import Scene
 from bake_core.spec import parse_spec
 from bake_core.tracer import Tracer
@@ -40,7 +40,7 @@ def measured(
 ) -> tuple[Receivers, Array, Array]:
     """Receivers around zero, their irradiance, and its standard error."""
     r = draw_receivers(scene, tracer, [OVER], count, 3, boxes=boxes)
-    estimates = path_traced_irradiance(tracer, r, samples=samples, scrambles=4, seed=5, threads=threads)
+    estimates = irradiance_at(tracer, stands_of(tracer, r.places), samples=samples, scrambles=4, seed=5, threads=threads)
     return r, estimates.mean(0), estimates.std(0, ddof=1) / 2
 
 
@@ -108,7 +108,7 @@ def test_a_sealed_room_is_dark_and_counts(tmp_path: Path) -> None:
     tracer = build(scene)
     r = draw_receivers(scene, tracer, [dark], 200, 1, boxes=np.array([[[0.005, -1, -3], [5, 4, 3]]]))
     assert (len(r), r.behind, r.unseen) == (200, 0, 0)
-    assert not path_traced_irradiance(tracer, r, samples=16, scrambles=2, seed=0).any()
+    assert not irradiance_at(tracer, stands_of(tracer, r.places), samples=16, scrambles=2, seed=0).any()
 
 
 def test_threads_change_no_bit_and_seeds_do() -> None:
@@ -121,7 +121,7 @@ def test_threads_change_no_bit_and_seeds_do() -> None:
     one, two = (measured(scene, tracer, 200, 16, threads=n)[1] for n in (1, 2))
     assert one.tobytes() == two.tobytes()
     r = draw_receivers(scene, tracer, [OVER], 50, 3)
-    a, b = (path_traced_irradiance(tracer, r, samples=16, scrambles=1, seed=s) for s in (1, 2))
+    a, b = (irradiance_at(tracer, stands_of(tracer, r.places), samples=16, scrambles=1, seed=s) for s in (1, 2))
     assert (a != b).any()
 
 
@@ -130,10 +130,10 @@ def test_cancelling_and_progress() -> None:
     tracer = build(scene, environment=sky())
     r = draw_receivers(scene, tracer, [OVER], 100, 3)
     told: list[float] = []
-    path_traced_irradiance(tracer, r, samples=1, scrambles=1, seed=0, advance=told.append)
+    irradiance_at(tracer, stands_of(tracer, r.places), samples=1, scrambles=1, seed=0, advance=told.append)
     assert sum(told) >= 1
     with pytest.raises(Cancelled):
-        path_traced_irradiance(tracer, r, samples=1, scrambles=1, seed=0, cancelled=np.ones(1, np.uint8))
+        irradiance_at(tracer, stands_of(tracer, r.places), samples=1, scrambles=1, seed=0, cancelled=np.ones(1, np.uint8))
 
 
 def test_a_furnace_bundle_is_right_at_every_receiver(tmp_path: Path) -> None:

@@ -1,13 +1,9 @@
-"""How far GLSL is from numpy on each host, for docs/shaders.md: `python tests/conformance/hosts_table.py`, after `make chromium`."""
+"""How far GLSL is from numpy on each host, for docs/shaders.md: `python -m tests.conformance.hosts_table`, after `make chromium`."""
 
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import replace
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 from numpy.typing import NDArray
