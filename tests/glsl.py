@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.probe_textures import probe_layers, probe_module, probe_textures
-from bake_core.shader_compiler import compile_glsl, shader_text
-from bake_core.vulkan import Bindings, Device, compute_pipeline, storage
+from bake_core.item_shader import answer_items, packed
+from bake_core.probe_textures import probe_layers, probe_module
+from bake_core.shader_compiler import shader_text
+from bake_core.vulkan import Device
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -33,23 +34,6 @@ SWIFTSHADER = CHROMIUM / "usr" / "lib" / "chromium" / "vk_swiftshader_icd.json"
 # Items along a row of the browser's texture: every WebGL2 takes so many.
 WIDTH = 2048
 
-_COMPUTE = """#version 450
-layout(local_size_x = 64) in;
-layout(set = 0, binding = 0) readonly buffer Inputs {{ vec4 inputs[]; }};
-layout(set = 0, binding = 1) writeonly buffer Outputs {{ vec4 outputs[]; }};
-layout(push_constant) uniform Push {{ int count; }};
-{module}
-{answer}
-void main() {{
-    int i = int(gl_GlobalInvocationID.x);
-    if (i < count) {{
-        vec4 given[{inputs}], found[{rows}];
-        for (int k = 0; k < {inputs}; ++k) given[k] = inputs[{inputs} * i + k];
-        answer(given, found);
-        for (int k = 0; k < {rows}; ++k) outputs[{rows} * i + k] = found[k];
-    }}
-}}
-"""
 _FRAGMENT = """#version 300 es
 precision highp float;
 precision highp int;
@@ -69,21 +53,13 @@ void main() {{
 
 def on_vulkan(answer: str, inputs: Sequence[F64], rows: int, volumes: Sequence[VolumeData] = ()) -> F32:
     """As a compute shader, on the driver that the environment names."""
-    given = _packed(inputs)
-    n = len(given)
-    module = probe_module(volumes, 2) if volumes else shader_text("octahedral.glsl")
-    source = _COMPUTE.format(module=module, answer=answer, inputs=len(inputs), rows=rows)
     with Device() as device:
-        source_buffer, result = storage(device, given), storage(device, n * rows * 16)
-        bindings = Bindings(device, [source_buffer, result, *(probe_textures(device, volumes) if volumes else [])])
-        pipeline = compute_pipeline(device, compile_glsl(source, "comp", "test"), bindings)
-        device.run(lambda commands: commands.dispatch(pipeline, (n + 63) // 64, np.int32(n).tobytes()))
-        return result.read(np.float32, (n, rows, 4))
+        return answer_items(device, answer, inputs, rows, volumes)
 
 
 def on_webgl2(answer: str, inputs: Sequence[F64], rows: int, volumes: Sequence[VolumeData] = ()) -> F32:
     """As a fragment shader of GLSL ES 3.00, in headless Chromium; one pixel an item, one render target a row."""
-    given = _packed(inputs)
+    given = packed(inputs)
     n, height = len(given), -(-len(given) // WIDTH)
     items = np.zeros((len(inputs), height * WIDTH, 4), np.float32)
     items[:, :n] = given.swapaxes(0, 1)
@@ -106,13 +82,6 @@ def on_webgl2(answer: str, inputs: Sequence[F64], rows: int, volumes: Sequence[V
     job = {"source": source, "width": WIDTH, "height": height, "rows": rows, "textures": textures}
     found = np.frombuffer(base64.b64decode(_browse(job)), np.float32).reshape(rows, -1, 4)[:, :n]
     return np.ascontiguousarray(found.swapaxes(0, 1))
-
-
-def _packed(inputs: Sequence[F64]) -> F32:
-    """As vec4, (n, inputs, 4)."""
-    given = np.zeros((len(inputs[0]), len(inputs), 4), np.float32)
-    given[..., :3] = np.stack(inputs, 1)
-    return given
 
 
 def _browse(job: dict[str, object]) -> str:
