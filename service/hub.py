@@ -10,12 +10,12 @@ from typing import Any
 
 
 class Subscription:
-    """One listener's mailbox. `rows` is set when the store has something new; the event wakes it for that or for progress."""
+    """One listener's mailbox: the event wakes it. `rung` is another number when the store has something new."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, rung: int) -> None:
         self.loop = loop
         self.event = asyncio.Event()
-        self.rows = True
+        self.rung = rung
 
 
 class Hub:
@@ -25,6 +25,7 @@ class Hub:
         self._lock = threading.Lock()
         self._progress: dict[str, dict[str, Any]] = {}
         self._listeners: dict[str, set[Subscription]] = {}
+        self._rings = 0
 
     def tell(self, job: str) -> None:
         """The store has something new about a job."""
@@ -49,8 +50,8 @@ class Hub:
     @contextmanager
     def subscribe(self, job: str) -> Iterator[Subscription]:
         """Listen to a job, from the event loop of whoever calls."""
-        mine = Subscription(asyncio.get_running_loop())
         with self._lock:
+            mine = Subscription(asyncio.get_running_loop(), self._rings)
             self._listeners.setdefault(job, set()).add(mine)
         try:
             yield mine
@@ -67,8 +68,19 @@ class Hub:
 
     def _ring(self, job: str, rows: bool) -> None:
         with self._lock:
-            for one in self._listeners.get(job, ()):
-                one.rows = one.rows or rows
+            self._rings += 1
+            listeners = self._listeners.get(job, ())
+            if rows:
+                for one in listeners:
+                    one.rung = self._rings
+            # One call a loop: each is a system call, and hundreds may listen.
+            for loop in {one.loop for one in listeners}:
                 # A loop that has closed since has nobody left to hear.
-                if not one.loop.is_closed():
-                    one.loop.call_soon_threadsafe(one.event.set)
+                if not loop.is_closed():
+                    loop.call_soon_threadsafe(self._wake, job, loop)
+
+    def _wake(self, job: str, loop: asyncio.AbstractEventLoop) -> None:
+        with self._lock:
+            for one in self._listeners.get(job, ()):
+                if one.loop is loop:
+                    one.event.set()

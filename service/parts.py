@@ -7,6 +7,7 @@ import shutil
 
 from bake_core.errors import MachineError
 from service.blobs import Blobs
+from service.feed import Feed
 from service.hub import Hub
 from service.ledger import Ledger
 from service.outbox import Outbox
@@ -45,6 +46,7 @@ class Service:
         self.sandbox = Sandbox(settings.temporary_folder, settings.read_seconds, settings.read_memory)
         self.outlines = Outlines(self.blobs, self.sandbox)
         self.hub = Hub()
+        self.feed = Feed(self.store)
         self.ledger = Ledger(folder)
         self.tokens = Tokens(self.store.engine)
         self.outbox = Outbox(self.store.engine)

@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from fastapi.routing import APIRoute, APIRouter
+from obstore.exceptions import BaseError
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
@@ -97,6 +98,12 @@ def install(app: FastAPI, routers: Sequence[APIRouter]) -> None:
         log.error("unexpected", exc_info=error)
         return problem(500, "service.internal", "an error of the service itself; its log has the traceback")
 
+    async def store(_: Request, error: Exception) -> Response:
+        log.error("the blob store cannot be used: %s", error)
+        text = "the blob store cannot be used at the moment; nothing was kept of this request: send it again"
+        return problem(503, "service.store_unavailable", text, headers={"Retry-After": RETRY_SECONDS, "Connection": "close"})
+
+    app.add_exception_handler(BaseError, store)
     app.add_exception_handler(OSError, system)
     app.add_exception_handler(OperationalError, system)
     app.add_exception_handler(OctobakeError, ours)

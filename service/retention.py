@@ -24,6 +24,8 @@ from service.tables import blobs, jobs, reading, scenes, writing
 log = logging.getLogger("octobake.retention")
 
 CLEAN_SECONDS = 3600.0
+# By more than a clock that is kept right is ever moved at once.
+JUMP_SECONDS = 60.0
 DAY = 86400.0
 
 
@@ -38,7 +40,11 @@ class Cleanup:
 
 
 class Retention:
-    """Cleans up every hour, and when it is told to."""
+    """Cleans up every hour, and when it is told to.
+
+    An hour in which the wall clock was moved is left out: what it takes cannot be had back, and a clock that was moved by mistake is
+    likely to have been put right by the next.
+    """
 
     def __init__(self, settings: Settings, store: Store, files: Blobs) -> None:
         self._seconds, self._history_seconds = settings.retention_days * DAY, settings.history_days * DAY
@@ -46,6 +52,7 @@ class Retention:
         # One clean-up at a time.
         self._lock = threading.Lock()
         self._stopping = threading.Event()
+        self._clocks = _clocks()
         self._thread = threading.Thread(target=self._loop, name="octobake-retention", daemon=True)
 
     def start(self) -> None:
@@ -80,6 +87,10 @@ class Retention:
     def _loop(self) -> None:
         while not self._stopping.is_set():
             try:
+                if jump := self._jump():
+                    log.warning("the clock was moved by %+.0f s: nothing is cleaned up before the next hour", jump)
+                    self._stopping.wait(CLEAN_SECONDS)
+                    continue
                 taken = self.clean()
                 counted = [len(x) for x in (taken.jobs, taken.forgotten, taken.blobs, taken.scenes)]
                 if any(counted):
@@ -87,6 +98,12 @@ class Retention:
             except Exception:
                 log.exception("a clean-up failed; the next one goes on")
             self._stopping.wait(CLEAN_SECONDS)
+
+    def _jump(self) -> float:
+        """Seconds by which the wall clock was moved since this was asked last; 0 where by few."""
+        (wall, passed), self._clocks = self._clocks, _clocks()
+        moved = (self._clocks[0] - wall) - (self._clocks[1] - passed)
+        return moved if abs(moved) > JUMP_SECONDS else 0.0
 
     def _find(self, c: Connection) -> tuple[Cleanup, dict[str, float]]:
         """What is to go, and when each scene and blob of it was last used."""
@@ -139,6 +156,11 @@ class Retention:
             # Within the transaction, so that nobody can add the row again before the file is gone.
             self._files.remove_blob(digest)
             return True
+
+
+def _clocks() -> tuple[float, float]:
+    """The wall clock, and one that only goes on, while the machine sleeps, too."""
+    return time.time(), time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def _results(row: Any) -> Iterator[str]:

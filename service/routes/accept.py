@@ -88,17 +88,18 @@ async def wait_as_asked(service: Service, request: Request, response: Response, 
     seconds = min(int(match[1]), MOST_WAIT)
     response.headers["Preference-Applied"] = f"wait={seconds}"
     deadline = time.monotonic() + seconds
+    read: int | None = None
     with service.hub.subscribe(job.id) as news:
         while job.state not in FINISHED and (left := deadline - time.monotonic()) > 0:
             news.event.clear()
-            if news.rows:
-                news.rows = False
+            if news.rung != read:
+                read = news.rung
                 job = await run_in_threadpool(_now, service, job)
                 continue
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.event.wait(), min(left, POLL_SECONDS))
                 continue
-            news.rows = True
+            read = None
     return await run_in_threadpool(_now, service, job)
 
 

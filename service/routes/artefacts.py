@@ -19,13 +19,15 @@ _RANGE = re.compile(r"bytes=(\d*)-(\d*)\Z")
 _TAG = re.compile(r'(W/)?("[^"]*")')
 
 
-def artefact(request: Request, blobs: Blobs, digest: str, size: int, media_type: str, name: str) -> Response:
+async def artefact(request: Request, blobs: Blobs, digest: str, size: int, media_type: str, name: str) -> Response:
     """Answer GET or HEAD for the blob `digest`, to be saved as `name`.
 
     Raises
     ------
     RequestError
         ``request.precondition_failed`` (412) or ``request.range_not_satisfiable`` (416).
+    BaseError, OSError
+        Where the blob store cannot give it: before the answer has begun, so that the client is told.
     """
     etag = f'"{digest}"'
     # A finished job's files never change, so whoever has them need never ask again.
@@ -51,7 +53,7 @@ def artefact(request: Request, blobs: Blobs, digest: str, size: int, media_type:
     }
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=media_type)
-    return StreamingResponse(blobs.stream(digest, start, end), status, headers, media_type)
+    return StreamingResponse(await blobs.open(digest, start, end), status, headers, media_type)
 
 
 def _matches(field: str, etag: str, weak: bool) -> bool:

@@ -25,6 +25,7 @@ from service.routes.accept import KEY_HEADER, RETRY_AFTER, WAIT_HEADER, Key, acc
 from service.routes.artefacts import GET_HEADERS, HEAD_HEADERS, artefact
 from service.routes.bodies import JsonRoute
 from service.routes.common import Here, failures
+from service.routes.files import run_with_files
 from service.routes.jobs import add_job_routes, find, not_there
 from service.scenes import check_sky
 from service.webhooks import check_url
@@ -99,7 +100,7 @@ async def create_bake(
 ) -> Any:
     """Accept a bake. Once this has answered, the job survives whatever happens to the service."""
     if asked.validate_only:
-        spec, volumes = await run_in_threadpool(_validate, service, body)
+        spec, volumes = await run_with_files(_validate, service, body)
         answer = documents.Validation(
             valid=True,
             scene=body.scene,
@@ -138,7 +139,7 @@ async def create_bake(
             key=key,
         )
 
-    job = await run_in_threadpool(once, service, request, body.model_dump(mode="json"), add)
+    job = await run_with_files(once, service, request, body.model_dump(mode="json"), add)
     if hit:
         # RFC 9211.
         response.headers["Cache-Status"] = "octobake; hit"
@@ -239,12 +240,12 @@ def get_plan(id: str, service: Here) -> documents.Plan:
     },
     openapi_extra=GET_HEADERS,
 )
-def get_preview(id: str, request: Request, service: Here) -> Response:
+async def get_preview(id: str, request: Request, service: Here) -> Response:
     """Answer a picture of the last whole pass; while the bake runs it changes, and is not to be kept."""
-    job = find(service, Kind.BAKE, id)
-    if job.state in ACTIVE and (picture := service.blobs.peek_work(id, PREVIEW)) is not None:
+    job = await run_in_threadpool(find, service, Kind.BAKE, id)
+    if job.state in ACTIVE and (picture := await run_with_files(service.blobs.peek_work, id, PREVIEW)) is not None:
         return Response(picture, headers={"Cache-Control": "no-store"}, media_type="image/png")
-    return _file(service, request, id, "preview", "image/png", "png")
+    return await _file(service, request, id, "preview", "image/png", "png")
 
 
 @router.get(
@@ -268,9 +269,9 @@ def get_preview(id: str, request: Request, service: Here) -> Response:
     response_class=Response,
     responses=failures(404, 409, 410, 412),
 )
-def get_bundle(id: str, request: Request, service: Here) -> Response:
+async def get_bundle(id: str, request: Request, service: Here) -> Response:
     """Answer the bundle, whole or a range of it; `ETag` and `Repr-Digest` are its sha256."""
-    return _file(service, request, id, "bundle", "application/zip", "zip")
+    return await _file(service, request, id, "bundle", "application/zip", "zip")
 
 
 @router.get(
@@ -281,16 +282,16 @@ def get_bundle(id: str, request: Request, service: Here) -> Response:
     response_class=Response,
     responses={200: {"description": "report.json.", "content": {"application/json": {}}}, **failures(404, 409, 410, 412, 416)},
 )
-def get_report(id: str, request: Request, service: Here) -> Response:
+async def get_report(id: str, request: Request, service: Here) -> Response:
     """Answer report.json: what was done, how long it took, and the error against time."""
-    return _file(service, request, id, "report", "application/json", "json")
+    return await _file(service, request, id, "report", "application/json", "json")
 
 
-def _file(service: Service, request: Request, id: str, what: str, media_type: str, suffix: str) -> Response:
-    job = find(service, Kind.BAKE, id)
+async def _file(service: Service, request: Request, id: str, what: str, media_type: str, suffix: str) -> Response:
+    job = await run_in_threadpool(find, service, Kind.BAKE, id)
     if job.state != State.SUCCEEDED or job.result is None or what not in job.result:
         raise not_there(job, what)
     digest = job.result[what]
-    size = service.store.blob_size(digest)
+    size = await run_in_threadpool(service.store.blob_size, digest)
     assert size is not None, "a result names blobs that were recorded before it"
-    return artefact(request, service.blobs, digest, size, media_type, f"{id}.{suffix}")
+    return await artefact(request, service.blobs, digest, size, media_type, f"{id}.{suffix}")

@@ -12,6 +12,7 @@ from service.blobs import DIGEST
 from service.problems import RequestError
 from service.routes.bodies import limited, receive
 from service.routes.common import Here, failures, unknown
+from service.routes.files import run_with_files
 
 router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
 # In the document the pattern only: a name that is no digest is a blob that cannot exist, which the handlers say in their own way.
@@ -55,7 +56,7 @@ async def put_blob(digest: Name, request: Request, service: Here) -> Response:
         await receive(request, upload, service.settings.max_upload_bytes)
         if upload.digest != digest:
             raise RequestError("blob.digest_mismatch", f"the bytes that arrived have {upload.digest}; send them again", "body", 422)
-        await run_in_threadpool(upload.keep)
+        await run_with_files(upload.keep)
         await run_in_threadpool(service.store.add_blob, digest, upload.size)
     return Response(status_code=201)
 

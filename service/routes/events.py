@@ -6,14 +6,12 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import suppress
-from datetime import UTC, datetime
 
 from fastapi import Request
-from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from service.jobs import FINISHED
+from service.feed import LINE_END
 from service.parts import Service
 from service.problems import RequestError
 
@@ -21,7 +19,6 @@ from service.problems import RequestError
 POLL_SECONDS = 5.0
 # Proxies close a silent connection after a minute, often after thirty seconds.
 PING_SECONDS = 15
-PAGE = 1000
 
 
 def event_stream(request: Request, service: Service, job: str) -> Response:
@@ -35,33 +32,26 @@ def event_stream(request: Request, service: Service, job: str) -> Response:
     given = request.headers.get("last-event-id", "0")
     if not given.isdecimal() or len(given) > 18:
         raise RequestError("request.invalid", "is not an id that this service gave an event", "Last-Event-ID")
-    return EventSourceResponse(_follow(service, job, int(given)), ping=PING_SECONDS, sep="\n")
+    return EventSourceResponse(_follow(service, job, int(given)), ping=PING_SECONDS, sep=LINE_END)
 
 
-def _over(service: Service, job: str, last: int) -> bool:
-    """Whether a job has finished and all of its events up to `last` have been told; one that is queued again goes on."""
-    now = service.store.job(job)
-    return now is not None and now.state in FINISHED and not service.store.events(job, last, 1)
-
-
-async def _follow(service: Service, job: str, last: int) -> AsyncIterator[ServerSentEvent]:
-    shown = None
+async def _follow(service: Service, job: str, last: int) -> AsyncIterator[ServerSentEvent | bytes]:
+    shown = read = None
     with service.hub.subscribe(job) as news:
         while True:
             news.event.clear()
-            if news.rows:
-                # Lowered before the store is asked: what is rung in the meantime is asked for again.
-                news.rows = False
-                events = await run_in_threadpool(service.store.events, job, last, PAGE)
-                for event in events:
-                    last = event.id
-                    data = {"at": datetime.fromtimestamp(event.at, UTC).isoformat(), **event.data}
-                    yield ServerSentEvent(json.dumps(data), event=event.type, id=str(event.id))
-                if len(events) == PAGE:
-                    news.rows = True
-                    continue
-                if await run_in_threadpool(_over, service, job, last):
+            if news.rung != read:
+                # Noted before the store is asked: what is rung in the meantime is asked for again.
+                read = news.rung
+                page = await service.feed.after(job, last, read)
+                for number, event in page.events:
+                    last = number
+                    yield event
+                if page.over:
                     return
+                if page.events:
+                    read = None
+                    continue
             progress = service.hub.progress(job)
             if progress is not None and progress != shown:
                 shown = progress
@@ -69,4 +59,4 @@ async def _follow(service: Service, job: str, last: int) -> AsyncIterator[Server
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.event.wait(), POLL_SECONDS)
                 continue
-            news.rows = True
+            read = None

@@ -19,6 +19,7 @@ from service.problems import RequestError
 from service.routes.accept import RETRY_AFTER, WAIT_HEADER, wait_as_asked
 from service.routes.common import Here, failures, unknown
 from service.routes.events import event_stream
+from service.routes.files import run_with_files
 
 
 class _JobConvertor(StringConvertor):
@@ -95,15 +96,19 @@ def add_job_routes(
             response.headers["Retry-After"] = RETRY_AFTER
         return await run_in_threadpool(document, service, job, False)
 
-    def cancel_job(id: str, service: Here) -> Document:
+    def cancel(service: Service, id: str) -> Job:
         find(service, kind, id)
         job = service.store.cancel(id)
-        if job.state == State.CANCELLED:
-            # It was queued; a restart may have put it there with a part of its work done.
-            service.blobs.remove_work(id)
         service.hub.tell(id)
         service.scheduler.cancel(id)
-        return document(service, job, False)
+        return job
+
+    async def cancel_job(id: str, service: Here) -> Document:
+        job = await run_in_threadpool(cancel, service, id)
+        if job.state == State.CANCELLED and job.started is not None:
+            # It was queued by a restart, with a part of its work done.
+            await run_with_files(service.blobs.remove_work, id)
+        return await run_in_threadpool(document, service, job, False)
 
     def requeue_job(id: str, service: Here) -> Document:
         job = find(service, kind, id)

@@ -17,6 +17,7 @@ from service.parts import Service
 from service.problems import RequestError
 from service.routes.bodies import media_type, read_json, receive
 from service.routes.common import Here, failures, unknown
+from service.routes.files import run_with_files
 
 GLB_TYPES = ("model/gltf-binary", "application/octet-stream", "")
 # What a GLB that is sent as a body is called; its digest does not depend on it.
@@ -49,15 +50,15 @@ async def create_scene(request: Request, service: Here) -> Response:
     kind = media_type(request)
     if kind == "application/json":
         body = await read_json(request, service.settings.max_json_bytes)
-        return await run_in_threadpool(_from_blobs, service, body)
+        return await run_with_files(_from_blobs, service, body)
     if kind not in (*GLB_TYPES, ZIP_TYPE):
         text = "send a GLB as model/gltf-binary, a zip as application/zip, or names of blobs as application/json"
         raise RequestError("request.unsupported_media_type", text, "Content-Type", 415)
     with service.blobs.upload() as upload:
         await receive(request, upload, service.settings.max_upload_bytes)
         name = ZIP_NAME if kind == ZIP_TYPE else GLB_NAME
-        outline, contents = await run_in_threadpool(service.outlines.read, name, {name: upload.path})
-        await run_in_threadpool(upload.keep)
+        outline, contents = await run_with_files(service.outlines.read, name, {name: upload.path})
+        await run_with_files(upload.keep)
         await run_in_threadpool(service.store.add_blob, upload.digest, upload.size)
         return await run_in_threadpool(_add, service, name, {name: upload.digest}, outline.digest, contents)
 

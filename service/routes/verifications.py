@@ -121,13 +121,13 @@ add_job_routes(router, Kind.VERIFICATION, documents.Verification, _document, _ne
     response_class=Response,
     responses=failures(404, 409, 410, 412),
 )
-def get_file(id: str, name: str, request: Request, service: Here) -> Response:
+async def get_file(id: str, name: str, request: Request, service: Here) -> Response:
     """Answer one of the files that the result lists."""
-    job = find(service, Kind.VERIFICATION, id)
+    job = await run_in_threadpool(find, service, Kind.VERIFICATION, id)
     if job.state != State.SUCCEEDED or job.result is None:
         raise not_there(job, name)
     stored = job.result["files"].get(name)
     if stored is None:
         raise unknown("file", name)
     kind = MEDIA_TYPES.get(name.rpartition(".")[2], "application/octet-stream")
-    return artefact(request, service.blobs, stored["digest"], stored["bytes"], kind, name.rpartition("/")[2])
+    return await artefact(request, service.blobs, stored["digest"], stored["bytes"], kind, name.rpartition("/")[2])

@@ -51,13 +51,13 @@ class InProcess:
     """Requests to an application in this process."""
 
     def __init__(self, app: FastAPI) -> None:
-        self._app = app
+        self.app = app
 
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """One request and its whole answer; an error that the application lets through is the server's 500."""
 
         async def send() -> httpx.Response:
-            transport = httpx.ASGITransport(self._app, raise_app_exceptions=False)
+            transport = httpx.ASGITransport(self.app, raise_app_exceptions=False)
             async with httpx.AsyncClient(transport=transport, base_url="http://octobake") as client:
                 return await client.request(method, path, **arguments)
 

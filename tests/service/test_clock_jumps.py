@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from service import outbox, retention, store
 from service.dask_configuration import configure
 from service.jobs import Kind, State
 from service.parts import Service
-from tests.service.running import InProcess
+from tests.service.running import InProcess, wait_for
 
 DAY = 86400.0
 
@@ -33,7 +34,8 @@ def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
     """The clock that job store and retention go by."""
     wall = Wall()
     for module in (store, retention):
-        monkeypatch.setattr(module, "time", SimpleNamespace(time=wall.time))
+        clocks = SimpleNamespace(time=wall.time, clock_gettime=time.clock_gettime, CLOCK_BOOTTIME=time.CLOCK_BOOTTIME)
+        monkeypatch.setattr(module, "time", clocks)
     return wall
 
 
@@ -73,6 +75,40 @@ def test_a_clock_that_is_set_back_takes_nothing_and_one_set_forward_only_what_it
     assert not service.retention.clean().jobs, "a clean-up asks the clock anew"
     found = service.store.job(running.id)
     assert found and found.state == State.PREPARING
+
+
+def test_the_hour_in_which_a_clock_was_moved_cleans_nothing_up(wall: Wall, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a machine does that boots with a clock of next year, and is set right by the network."""
+    monkeypatch.setattr(retention, "CLEAN_SECONDS", 0.1)
+    done = service.store.add_job(Kind.BAKE, {}, {}, 0)
+    service.store.claim()
+    service.store.move(done.id, State.FAILED, error={"slug": "bake.crashed"})
+    looked = threading.Event()
+    jump = service.retention._jump
+
+    def look() -> float:
+        moved = jump()
+        looked.set()
+        if moved:
+            # Set right again before the next look.
+            wall.off = 0.0
+        return moved
+
+    def state() -> State:
+        found = service.store.job(done.id)
+        assert found is not None
+        return found.state
+
+    monkeypatch.setattr(service.retention, "_jump", look)
+    wall.off = 400 * DAY
+    service.retention.start()
+    assert looked.wait(5)
+    time.sleep(0.5)
+    assert state() == State.FAILED
+    # Where it stays moved, it is believed.
+    monkeypatch.setattr(service.retention, "_jump", jump)
+    wall.off = 400 * DAY
+    wait_for(lambda: state() == State.EXPIRED, 5)
 
 
 def test_a_key_stands_for_its_request_over_a_jump_back(wall: Wall, service: Service) -> None:
