@@ -186,7 +186,7 @@ def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo:
 
 
 def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Callable[[I64, F64], F64]) -> tuple[F64, F64, I64]:
-    """Irradiance of the eight probes around points, by trilinear weights times others.
+    """Irradiance of the eight probes around points, by trilinear weights (:func:`tent`) times others.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Ca
         tile = np.where(kept, table[probe, 3] - 1, 0).astype(np.int64)
         probes[:, corner] = probe
         other[:, corner] = weigh(tile, volume.origin + volume.spacing * lattice + table[probe, :3]) * kept
-        trilinear[:, corner] = np.where(upper, fraction, 1 - fraction).prod(-1)
+        trilinear[:, corner] = tent(fraction - upper, table[probe, :3] / volume.spacing)
         light[:, corner] = bilinear(volume.atlases["irradiance"], tile, oct_toward)
     weights = trilinear * other
     # Where nothing is left, the point stands on a probe, an edge or a face of the grid none of whose probes is active.
@@ -225,6 +225,21 @@ def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Ca
     total = weights.sum(-1, keepdims=True)
     weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
     return (weights[:, :, None] * light).sum(1), weights, probes
+
+
+def tent(from_lattice: F64, offset: F64) -> F64:
+    """Trilinear weights of probes that have been moved. Mirrors ``obTent``.
+
+    Parameters
+    ----------
+    from_lattice : (m, 3) float64
+        From the probe's lattice point to the point asked for, spacings, in [-1, 1].
+    offset : (m, 3) float64
+        From its lattice point to the probe, spacings, less than 1.
+    """
+    from_probe = from_lattice - offset
+    out: F64 = np.maximum(1 - np.abs(from_probe) / (1 + np.where(from_probe < 0, offset, -offset)), 0).prod(-1)
+    return out
 
 
 def bilinear(atlas: Atlas, tile: I64, oct_xy: NDArray[np.floating]) -> F64:

@@ -19,7 +19,7 @@ _MOST_PAIRS = 1 << 28
 _PLANES = 64
 
 
-def nothing_occludes(scene: Scene, volume: Volume) -> bool:
+def nothing_occludes(scene: Scene, volume: Volume, probes: F64) -> bool:
     """Whether no probe of a volume can be hidden from a surface within its reach, whatever the shape of the two.
 
     For every triangle that meets the volume's reach, all probes and all corners of such triangles must lie on one side of its plane,
@@ -29,21 +29,24 @@ def nothing_occludes(scene: Scene, volume: Volume) -> bool:
     Not a word is said of what lies behind a double-sided surface: from there no probe is seen at all. Nor is anything that fails the test
     known to occlude: the answer is then no.
 
+    Parameters
+    ----------
+    probes : (n, 3) float64
+        Where they stand, local frame; any points within reach whose hull holds them do as well.
+
     Returns
     -------
     bool
         Also where no triangle is in reach.
     """
     box = reach_box(scene, volume)
-    first, last = volume.origin - scene.origin, volume.origin - scene.origin + (np.asarray(volume.counts) - 1) * volume.spacing
-    probes = np.array([[(first, last)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
     found = []
     for corners in triangles_meeting(scene, box):
         if not _one_sided(corners, probes):
             return False
         found.append(corners)
         count = sum(len(c) for c in found)
-        if 3 * count * count > _MOST_PAIRS:
+        if count * max(3 * count, len(probes)) > _MOST_PAIRS:
             return False
     if not found:
         return True

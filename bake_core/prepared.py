@@ -81,16 +81,21 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     spec = spec.model_copy(update={"environment": named})
     positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
     whole = Tracer.build(scene, spec, environment)
+    moves = [spec.relocates(v.probe_count) for v in volumes]
     offsets = np.zeros(positions.shape, np.float32)
-    if spec.probes == "relocated":
+    if any(moves):
         offsets = relocate(whole, volumes, positions)
+        offsets[~np.repeat(moves, [v.probe_count for v in volumes])] = 0
         positions = positions + offsets
+    stand = np.split(positions, np.cumsum([v.probe_count for v in volumes])[:-1])
+    stand = [s if moved else _corners(v) - scene.origin for v, moved, s in zip(volumes, moves, stand, strict=True)]
+    selection = select(scene, spec, volumes, stand)
     shines = environment.sky is not None or bool(environment.constant.any())
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
-        selection=select(scene, spec, volumes),
+        selection=selection,
         tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
         whole=whole,
         positions=positions,
@@ -99,6 +104,13 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
         units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
         needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
     )
+
+
+def _corners(volume: Volume) -> NDArray[np.float64]:
+    """The outermost lattice points, (8, 3), world."""
+    upper = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
+    corners: NDArray[np.float64] = volume.origin + upper * (np.asarray(volume.counts) - 1) * volume.spacing
+    return corners
 
 
 def needed_probes(scene: Scene, volumes: Sequence[Volume]) -> NDArray[np.bool_]:

@@ -16,6 +16,8 @@ from bake_core.reach import reach_box, triangles_meeting
 from bake_core.scene import NO_TEXTURE, Scene
 from bake_core.spec import OUTPUTS, OutputName, Spec
 
+F64 = NDArray[np.float64]
+
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
 _CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
 # Of a texel as it is usually stored: halves of three colours, floats of two moments and half a float of the walls, one float, halves of a
@@ -86,13 +88,15 @@ class Selection:
         return (side + 2) ** 2 * _TEXEL_BYTES[output]
 
 
-def select(scene: Scene, spec: Spec, volumes: Sequence[Volume]) -> Selection:
+def select(scene: Scene, spec: Spec, volumes: Sequence[Volume], probes: Sequence[F64]) -> Selection:
     """Choose outputs: what the spec demands, or what the scene can make use of.
 
     Parameters
     ----------
     volumes : sequence of Volume
         The spec's, placed.
+    probes : sequence of (n, 3) float64
+        Where each volume's probes stand, or the corners of a box that holds them; local frame.
     """
     m = scene.materials
     # A metal of roughness 1 reflects as broadly as a matt surface does: its light is looked up in irradiance maps, too.
@@ -100,8 +104,7 @@ def select(scene: Scene, spec: Spec, volumes: Sequence[Volume]) -> Selection:
     glossy = bool(shiny[np.unique(scene.triangle_material)].any())
     reflects = glossy and any(_holds(scene, volume, shiny) for volume in volumes)
     auto = spec.outputs == "auto"
-    # The proof is of probes on their lattice.
-    seen = tuple(auto and spec.probes == "lattice" and nothing_occludes(scene, volume) for volume in volumes)
+    seen = tuple(auto and nothing_occludes(scene, volume, stand) for volume, stand in zip(volumes, probes, strict=True))
     if auto:
         kept = tuple(o for o in OUTPUTS if o == "irradiance" or (not all(seen) if o == "visibility" else reflects))
     else:

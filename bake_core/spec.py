@@ -168,11 +168,20 @@ class Spec(_Model):
     lights: Annotated[tuple[Light, ...], Field(max_length=65536)] = ()
     outputs: Literal["auto"] | Annotated[tuple[OutputName, ...], Field(min_length=1)] = "auto"
     receivers: Literal["everywhere", "surfaces"] = "everywhere"
-    probes: Literal["lattice", "relocated"] = "lattice"
+    probes: Literal["auto", "lattice", "relocated"] = "auto"
     resolution: Resolution = Resolution()
     max_bounces: Annotated[Whole, Field(ge=0, le=MAX_BOUNCES)] | None = None
     stop: Stop = Stop()
     seed: Annotated[Whole, Field(ge=0, lt=1 << 64)] = 0
+
+    def relocates(self, probes: int) -> bool:
+        """Whether a volume of so many probes may have them leave their lattice.
+
+        By itself where surfaces are to be lit from several; not where single maps are asked for, nor one probe at a place of
+        somebody's choice.
+        """
+        lights_surfaces = self.outputs == "auto" or {"irradiance", "visibility"} <= set(self.outputs)
+        return self.probes == "relocated" or (self.probes == "auto" and lights_surfaces and probes > 1)
 
     @model_validator(mode="after")
     def _named(self) -> Spec:

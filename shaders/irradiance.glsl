@@ -41,7 +41,15 @@ float obCrush(float weight) {
     return weight < threshold ? weight * weight * weight / (threshold * threshold) : weight;
 }
 
-// Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a probe the answer is that probe's) times
+// Trilinear weight of a probe, all lengths in spacings: along each axis 1 where it stands, falling to 0 at the lattice points next to its own. Of a
+// probe that has not been moved, that is linear interpolation; and where it has, weights still change without a step from cell to cell.
+float obTent(vec3 fromLattice, vec3 offset) {
+    vec3 fromProbe = fromLattice - offset;
+    vec3 axes = max(1.0 - abs(fromProbe) / (1.0 + mix(-offset, offset, vec3(lessThan(fromProbe, vec3(0.0))))), 0.0);
+    return axes.x * axes.y * axes.z;
+}
+
+// Irradiance from one volume. Probe weights are (trilinear, from the point itself: at a lattice point the answer is its probe's) times
 // (facing times visibility, crushed); probes inside geometry have no tile and no weight. They are the surface's, whichever way is asked.
 // w is 1, or 0 where none of the eight has a tile.
 vec4 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 toward) {
@@ -64,8 +72,7 @@ vec4 obIrradianceInVolume(int v, vec3 position, vec3 normal, vec3 wo, vec3 towar
         float weight = obFacing(probePosition - position, normal) * obVisibility(v, volume, tile, biased - probePosition);
         weight = obCrush(weight);
         vec3 irradiance = OB_IRRADIANCE(v, obTileCoordinates(volume, tile, volume.irradianceTexels, octToward));
-        vec3 axes = mix(1.0 - cell.fraction, cell.fraction, vec3(upper));
-        sum += vec4(irradiance, 1.0) * (weight * axes.x * axes.y * axes.z);
+        sum += vec4(irradiance, 1.0) * (weight * obTent(cell.fraction - vec3(upper), entry.xyz / volume.spacing));
         rest += vec4(irradiance, 1.0) * weight;
     }
     // Nothing in the first sum: the point stands on a probe, an edge or a face of the grid all of whose probes are inside geometry.

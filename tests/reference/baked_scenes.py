@@ -46,13 +46,14 @@ def files_of(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
 def bake_at(
     scene: Path,
     document: dict[str, Any],
-    resolution: dict[str, int],
+    changes: dict[str, Any],
     samples: int,
     folder: Path,
     outputs: Sequence[str] = ("irradiance", "visibility"),
 ) -> Volumes:
+    """Bake with exactly so many samples, and with some other keys of the spec."""
     stop = {"target_error": None, "max_samples": samples}
-    spec = parse_spec({**document, "outputs": list(outputs), "resolution": resolution, "stop": stop})
+    spec = parse_spec({**document, "outputs": list(outputs), "stop": stop, **changes})
     bake(scene, spec, folder / "bundle", threads=THREADS, audit_seconds=0)
     return read_bundle(folder / "bundle").volumes
 

@@ -12,7 +12,7 @@ import itertools
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from bake_core.leaks import leak_ratio
 from bake_core.light_field import arriving, light_field, trace
@@ -41,9 +41,9 @@ PATHS = 1024
 
 
 def with_baked(
-    name: str, variants: list[dict[str, int]], samples: int, outputs: tuple[str, ...], look: Callable[[Scene, Tracer, list[Volumes]], T]
+    name: str, variants: list[dict[str, Any]], samples: int, outputs: tuple[str, ...], look: Callable[[Scene, Tracer, list[Volumes]], T]
 ) -> T:
-    """What `look` makes of a scene's bakes, one for each variant of the resolution."""
+    """What `look` makes of a scene's bakes, one for each variant of the spec."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         path, document = files_of(name, folder)
@@ -60,7 +60,7 @@ def chain_bytes(volumes: Volumes, chain: str) -> int:
 
 
 def diffuse(samples: int, paths: int) -> str:
-    variants = [{"irradiance": n, "visibility": m} for n in IRRADIANCE for m in WALLS]
+    variants = [{"resolution": {"irradiance": n, "visibility": m}} for n in IRRADIANCE for m in WALLS]
 
     def best(ask: Callable[[Ask], float], bakes: list[Volumes]) -> list[float]:
         """Of ours as they are; of RTXGI's, the last one, with whichever biases are best."""
@@ -78,7 +78,7 @@ def diffuse(samples: int, paths: int) -> str:
     cornell = with_baked("cornell", [*variants, RTXGI], samples, outputs, errors)
     rooms, through, sizes = with_baked("two_rooms", [*variants, RTXGI], samples, outputs, in_rooms)
     stored = [(f"{e}", f"{w}", f"{m}", f"{e + w + PROBE_BYTES}") for e, w, m in sizes[:-1]] + [("256", "", "1024", f"{RTXGI_BYTES}")]
-    names = [f"{v['irradiance']}², {v['visibility']}²" for v in variants] + ["RTXGI: 6², 14²"]
+    names = [f"{v['resolution']['irradiance']}², {v['resolution']['visibility']}²" for v in variants] + ["RTXGI: 6², 14²"]
     rows = [
         (name, *held, f"{c:.4f}", f"{r:.4f}", f"{100 * leak:.3f} %")
         for name, held, c, r, leak in zip(names, stored, cornell, rooms, through, strict=True)
@@ -88,23 +88,21 @@ def diffuse(samples: int, paths: int) -> str:
 
 
 def glossy(samples: int, paths: int) -> str:
-    variants = [{"distance": n, "normal": n, "radiance": 16} for n in DISTANCE] + [
-        {"distance": 64, "normal": 64, "radiance": r} for r in RADIANCE
-    ]
+    sides = [(n, 16) for n in DISTANCE] + [(64, r) for r in RADIANCE]
+    variants = [{"resolution": {"distance": n, "normal": n, "radiance": r}} for n, r in sides]
 
     def look(scene: Scene, tracer: Tracer, bakes: list[Volumes]) -> str:
         rays, _, _, estimates = measure_radiance(scene, tracer, bakes[0], samples=paths, threads=THREADS)
         rows = []
-        for variant, volumes in zip(variants, bakes, strict=True):
+        for (distance, radiance), volumes in zip(sides, bakes, strict=True):
             traces = trace(light_field(volumes), rays.origins, rays.directions)
             told = compare_traces(volumes, rays, traces)
             light = compare_receivers(arriving(volumes, traces, rays.origins, rays.directions, 0.0), estimates)
             stored = [bytes_of(volumes, name) for name in ("distance", "normal", "radiance")] + [
                 chain_bytes(volumes, chain) for chain in CHAINS
             ]
-            sides = f"{variant['distance']}², {variant['radiance']}²"
             figures = (f"{100 * told.agree:.2f} %", f"{100 * told.false_hits:.2f} %", f"{light.relmse:.4f}", f"{light.p95:.3f}")
-            rows.append((sides, *map(str, stored), str(sum(stored)), *figures))
+            rows.append((f"{distance}², {radiance}²", *map(str, stored), str(sum(stored)), *figures))
         heads = ("distance and normal, radiance", "distance", "normal", "radiance", *CHAINS, "in all")
         return markdown((*heads, "agree", "false hits", "relMSE", "95th percentile"), rows)
 

@@ -26,6 +26,7 @@ from bake_core.gltf.reader import load_scene
 from bake_core.gltf.writer import GlbWriter
 from bake_core.irradiance import sample
 from bake_core.octahedral import oct_to_dir, texel_directions, with_border
+from bake_core.parameters import PARAMETERS
 from bake_core.prepared import prepare
 from bake_core.progress import Progress
 from bake_core.report import Run
@@ -423,6 +424,7 @@ def test_probes_inside_geometry_are_inactive(tmp_path: Path) -> None:
     w.node("box", mesh=w.mesh("box", [part]))
     spec = {
         "volumes": [{"origin": [0.1, 0.1, 0.1], "spacing": [2, 2, 2], "counts": [2, 1, 1]}],
+        "probes": "lattice",
         "environment": sky(),
         "stop": {"target_error": None, "max_samples": 16},
     }
@@ -460,7 +462,9 @@ def test_leaving_out_probes_inside_solids_changes_nothing_else(tmp_path: Path, m
 
     random = np.random.default_rng(5)
     points, normals = random.uniform(-2, 2, (500, 3)), oct_to_dir(random.uniform(-1, 1, (500, 2)))
-    ours, theirs = (sample(bundle.volumes, points, normals) for bundle in (a, b))
+    # What a bake measures at surfaces to choose by is of all its probes: asked for with the same parameters.
+    both = (replace(bundle.volumes[0], parameters=PARAMETERS) for bundle in (a, b))
+    ours, theirs = (sample([volume], points, normals) for volume in both)
     weights = theirs.weights * kept[theirs.probes]
     some = weights.sum(-1) > 0
     np.testing.assert_allclose(ours.weights[some], weights[some] / weights[some].sum(-1, keepdims=True), rtol=1e-12)

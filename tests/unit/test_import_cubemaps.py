@@ -74,7 +74,7 @@ def test_cube_maps_of_a_baked_room_give_its_bundle(tmp_path: Path) -> None:
     grid = {"name": "room", "origin": [-0.6, 0.3, 0.7], "spacing": [1.2, 1.4, 1.3], "counts": [2, 2, 1]}
     sides = {"radiance": 32, "distance": 32, "normal": 32}
     stop = {"target_error": None, "max_samples": 16}
-    baked = bake_example(tmp_path, example, volumes=[grid], resolution=sides, stop=stop).volumes[0]
+    baked = bake_example(tmp_path, example, volumes=[grid], resolution=sides, stop=stop, probes="lattice").volumes[0]
     scene = load_scene(tmp_path / "scene.glb")
     tracer = prepare(scene, parse_spec({"version": 1, "volumes": [grid]})).tracer
     captured = tmp_path / "captured"

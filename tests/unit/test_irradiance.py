@@ -46,6 +46,32 @@ def test_at_a_probe_the_answer_is_the_probes_own() -> None:
     np.testing.assert_array_equal(found.weights.max(-1), 1)
 
 
+def test_a_tent_stands_on_its_probe_and_ends_at_the_lattice_points_about_its_own() -> None:
+    random = np.random.default_rng(3)
+    offset = random.uniform(-0.45, 0.45, (200, 3))
+    np.testing.assert_allclose(irradiance.tent(offset, offset), 1, rtol=1e-15)
+    points = random.uniform(-1, 1, (200, 3))
+    np.testing.assert_allclose(irradiance.tent(points, 0 * offset), (1 - np.abs(points)).prod(-1), rtol=1e-12)
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            edge = np.where(np.arange(3) == axis, side, points)
+            np.testing.assert_allclose(irradiance.tent(edge, offset), 0, atol=1e-15)
+
+
+def test_answers_of_moved_probes_change_without_a_step_from_cell_to_cell() -> None:
+    """On both sides of every lattice plane, as close as numbers go; at a lattice point its own probe answers alone."""
+    volume = in_the_open((4, 4, 4))
+    random = np.random.default_rng(4)
+    volume = filled(volume, "irradiance", random.uniform(1, 2, (64, 1, 1, 3)))
+    volume = replace(volume, offsets=random.uniform(-0.45, 0.45, (64, 3)).astype(np.float32))
+    planes = random.integers(1, 3, (300, 1))
+    points = np.where(np.arange(3) == random.integers(0, 3, (300, 1)), planes, random.uniform(0, 3, (300, 3)))
+    up = np.tile([0.0, 1.0, 0.0], (300, 1))
+    below, above = (irradiance.sample((volume,), points + step, up).irradiance for step in (-1e-9, 1e-9))
+    np.testing.assert_allclose(below, above, rtol=1e-7)
+    np.testing.assert_allclose(irradiance.sample((volume,), [[1.0, 2.0, 1.0]], [[0.0, 1.0, 0.0]]).weights.max(), 1, rtol=1e-12)
+
+
 def test_in_the_open_light_that_varies_linearly_is_interpolated_linearly() -> None:
     """With a normal across the gradient, facing weights of the two sides are alike and only the trilinear weights differ."""
     volume = in_the_open((3, 1, 1))

@@ -112,7 +112,7 @@ def test_what_is_proven_no_segment_contradicts(name: str) -> None:
         writer.node("empty")
     scene = load(writer)
     (volume,) = place(scene, parse_spec({"volumes": [document]}))
-    assert nothing_occludes(scene, volume) == expected
+    assert nothing_occludes(scene, volume, volume.positions() - scene.origin) == expected
     assert not (expected and hidden(scene, document))
 
 
@@ -125,7 +125,7 @@ def test_the_segments_do_find_what_occludes(name: str) -> None:
 def test_too_large_for_a_proof_is_not_proven() -> None:
     scene = load(ball(6))
     (volume,) = place(scene, parse_spec({"volumes": [grid(-0.4, 0.8)]}))
-    assert not nothing_occludes(scene, volume)
+    assert not nothing_occludes(scene, volume, volume.positions() - scene.origin)
 
 
 STOP = {"target_error": None, "max_samples": 16}

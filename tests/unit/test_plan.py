@@ -37,7 +37,8 @@ def spec(**changes: Any) -> Any:
 
 def chosen_of(scene: Scene, **changes: Any) -> Selection:
     wanted = spec(**changes)
-    return select(scene, wanted, place(scene, wanted))
+    volumes = place(scene, wanted)
+    return select(scene, wanted, volumes, [v.positions() - scene.origin for v in volumes])
 
 
 @pytest.mark.parametrize(("material", "glossy"), [({}, False), ({"metallic": 1.0}, False), ({"roughness": 0.5}, True)])

@@ -16,19 +16,22 @@ from bake_core.spec import parse_spec
 from tests.baking import bake_example
 from tests.unit.test_transport import load_example
 
+# Of a spacing, of a probe half a spacing from a wall.
+THIRD = 1.5 * 2.5 / 11
+
 
 def moved(glb: bytes, **volume: object) -> np.ndarray:
     spec = parse_spec({"version": 1, "volumes": [volume], "probes": "relocated"})
     return np.asarray(prepare(load_example(glb), spec).offsets)
 
 
-def test_a_probe_half_a_cell_from_a_wall_moves_by_fifteen_hundredths() -> None:
-    """In two rooms every outermost probe has a wall half a metre off on one side of each axis: m = 3 d² / (6 d + 2 s) = 0.15."""
+def test_a_probe_half_a_cell_from_a_wall_moves_by_a_third_of_one() -> None:
+    """In two rooms every outermost probe has a wall half a metre off on one side of each axis: m = 3 d (d + 2 s) / (6 d + 8 s)."""
     glb, document = two_rooms()
     found = moved(glb, **document["volumes"][0]).reshape(4, 3, 8, 3)
-    np.testing.assert_allclose(found[..., 0], np.array([-0.15, 0, 0, 0.15, -0.15, 0, 0, 0.15]) * np.ones((4, 3, 1)), atol=0.01)
-    np.testing.assert_allclose(np.delete(found[..., 1], 2, 1), np.array([-0.15, 0])[None, :, None] * np.ones((4, 1, 8)), atol=1e-6)
-    np.testing.assert_allclose(found[:, 0, :, 2], np.array([-0.15, 0, 0, 0.15])[:, None] * np.ones((1, 8)), atol=1e-6)
+    np.testing.assert_allclose(found[..., 0], THIRD * np.array([-1, 0, 0, 1, -1, 0, 0, 1]) * np.ones((4, 3, 1)), atol=0.01)
+    np.testing.assert_allclose(np.delete(found[..., 1], 2, 1), THIRD * np.array([-1, 0])[None, :, None] * np.ones((4, 1, 8)), atol=1e-6)
+    np.testing.assert_allclose(found[:, 0, :, 2], THIRD * np.array([-1, 0, 0, 1])[:, None] * np.ones((1, 8)), atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
@@ -42,7 +45,7 @@ def test_between_two_walls_a_probe_stands_in_the_middle(scale: float) -> None:
 
 def test_backs_draw_nobody_and_double_sided_walls_do() -> None:
     """Outside of a box whose walls face inwards, there is nothing but backs; the same walls double-sided are walls."""
-    for double_sided, expected in ((False, 0.0), (True, 3 * 0.25 / (3 + 2))):
+    for double_sided, expected in ((False, 0.0), (True, THIRD)):
         w = GlbWriter()
         wall = w.material("wall", (0.5,) * 3, double_sided=double_sided)
         w.node("box", mesh=w.mesh("box", [quads_part(box_sides((0, -9, -9), (1, 9, 9)), wall)]))
@@ -55,11 +58,26 @@ def test_nobody_goes_far_or_through_anything(tmp_path: Path) -> None:
     glb, document = cornell()
     grid = {**document["volumes"][0], "spacing": [0.5] * 3, "counts": [4, 4, 4]}
     kept: dict[str, Any] = {"volumes": [grid], "stop": {"target_error": None, "max_samples": 4}, "outputs": ["irradiance", "visibility"]}
-    still = bake_example(tmp_path, (glb, document), **kept).volumes[0]
-    bundle = bake_example(tmp_path, (glb, document), **kept, probes="relocated")
+    still = bake_example(tmp_path, (glb, document), **kept, probes="lattice").volumes[0]
+    bundle = bake_example(tmp_path, (glb, document), **kept)
     (volume,) = bundle.volumes
     assert volume.offsets.any() and (np.abs(volume.offsets) <= FARTHEST * 0.5).all()
     assert (volume.states >= still.states).all()
     told = np.array(bundle.manifest["volumes"][0]["probes"]["offsets"], np.float32)
     np.testing.assert_array_equal(told, volume.offsets)
     np.testing.assert_allclose(volume.positions() - still.positions(), volume.offsets, atol=1e-6)
+
+
+def test_probes_stay_where_light_on_surfaces_is_not_what_they_are_for() -> None:
+    """Maps asked for by name are of the lattice, unless both that surfaces are lit from are among them; one probe stays where it is put."""
+    glb, document = cornell()
+    for outputs, moves in (
+        (["irradiance"], False),
+        (["radiance", "irradiance"], False),
+        (["visibility", "irradiance"], True),
+        ("auto", True),
+    ):
+        spec = parse_spec({**document, "outputs": outputs})
+        assert prepare(load_example(glb), spec).offsets.any() == moves
+    single = {**document["volumes"][0], "counts": [1, 1, 1]}
+    assert not prepare(load_example(glb), parse_spec({**document, "volumes": [single]})).offsets.any()

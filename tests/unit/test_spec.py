@@ -65,7 +65,7 @@ def test_everything_but_volumes_has_a_default() -> None:
         "lights": [],
         "outputs": "auto",
         "receivers": "everywhere",
-        "probes": "lattice",
+        "probes": "auto",
         "resolution": {"irradiance": 8, "visibility": 16, "radiance": None, "distance": 64, "normal": 64},
         "max_bounces": None,
         "stop": {"target_error": 0.02, "max_seconds": None, "max_samples": 256},
