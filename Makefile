@@ -4,7 +4,7 @@ BIN := .venv/bin
 LOCKS := requirements.txt requirements-dev.txt
 PROJECTS := pyproject.toml clients/python/pyproject.toml
 
-.PHONY: help setup system-packages demo check test test-slow test-drivers chromium chaos fuzz service-figures image-test lock clean
+.PHONY: help bench setup system-packages demo check test test-slow test-drivers chromium chaos fuzz service-figures image-test lock clean
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test-drivers   setup, chromium; then the GLSL module on lavapipe, on SwiftShader and on WebGL2"
 	@echo "make chaos       setup; then 1,000 random kills of a service and its worker, about an hour (ARGS=\"--kills N --seed S\")"
 	@echo "make fuzz        setup; then coverage-guided fuzzing of the scene reader, five minutes (ARGS=\"--seconds N --seed S\"); Linux, x86-64"
+	@echo "make bench       setup; then every \`octobake bench\` on scenes of our own, five minutes on a quiet machine; out/bench has the tables and their history"
 	@echo "make service-figures   setup; then what the service holds under load, two minutes on a quiet machine (ARGS=all: every goal, about an hour)"
 	@echo "make image-test  build docker/Dockerfile with buildah (root, Debian), start it, bake and verify through it"
 	@echo "make check       setup; then lint, format, types, import layers, shaders for both targets"
@@ -59,6 +60,15 @@ chaos: setup
 
 fuzz: setup
 	nice -n 19 $(BIN)/python -m tests.faults.fuzz $(ARGS)
+
+bench: setup
+	$(BIN)/octobake bench throughput -o out/bench
+	$(BIN)/octobake bench scale -o out/bench --triangles-sizes 1000,10000,100000
+	$(BIN)/octobake bench service -o out/bench --bake-seconds 10
+	$(BIN)/octobake bench convergence -o out/bench --samples 16,64 --runs 1 --reference-samples 512
+	$(BIN)/octobake bench targets -o out/bench --targets 0.05,0.02
+	$(BIN)/octobake bench adaptive -o out/bench --runs 1
+	$(BIN)/octobake bench leaving-out -o out/bench --runs 1
 
 service-figures: setup
 	$(BIN)/python -m tests.service.figures $(ARGS)

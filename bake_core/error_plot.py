@@ -87,8 +87,9 @@ def log_frame(
     x_ticks: Sequence[float],
     y_ticks: Sequence[float],
     label: str,
+    unit: str = " %",
 ) -> Callable[[float, float], Place]:
-    """Draw a frame with a grid and numbers, errors in percent upwards.
+    """Draw a frame with a grid and numbers.
 
     Parameters
     ----------
@@ -98,6 +99,8 @@ def log_frame(
         Pixels.
     x_ticks, y_ticks : sequence of float
         From :func:`ticks`.
+    unit : str
+        Of what goes upwards.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def log_frame(
     for x in x_ticks[::every]:
         texts.append(Text((at(x, y_low)[0], bottom + 19), f"{x:g}", 12, INK, "middle"))
     for y in y_ticks:
-        texts.append(Text((left - 8, at(x_low, y)[1] + 4), f"{y:g} %", 12, INK, "end"))
+        texts.append(Text((left - 8, at(x_low, y)[1] + 4), f"{y:g}{unit}", 12, INK, "end"))
     texts.append(Text(((left + right) / 2, bottom + 42), label, 13, INK, "middle"))
     corners = [at(x_low, y_low), at(x_high, y_low), at(x_high, y_high), at(x_low, y_high), at(x_low, y_low)]
     lines.extend(Line(a, b, INK, 1) for a, b in pairwise(corners))

@@ -212,3 +212,41 @@ def tunnel() -> Example:
     w.node("tunnel", mesh=w.mesh("tunnel", [quads_part(sides, stone), quads_part([glow], lamp)]))
     grid = {"name": "tunnel", "origin": [-1.6, 0.45, 0.3], "spacing": [1.0, 1.0, 1.0], "counts": [4, 3, 16]}
     return w.to_glb(), {"version": 1, "volumes": [grid]}
+
+
+def rough_floor(triangles: int) -> Example:
+    """A closed room of 2 × 2 × 2 m under a lamp, with a bumpy floor of about so many triangles: one in which trees have something to do."""
+    side = max(1, round(math.sqrt(triangles / 2)))
+    at = np.linspace(-1, 1, side + 1)
+    z, x = np.meshgrid(at, at, indexing="ij")
+    # Bumps of 5 cm that do not repeat with the grid, from nothing but products: the same bytes on every machine.
+    height = 0.1 * ((x * 7.3) % 1 - 0.5) * ((z * 5.9) % 1 - 0.5) + 0.05
+    corners = np.stack([x, height, z], -1).reshape(-1, 3)
+    low = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    quads = np.stack([low, low + side + 1, low + side + 2, low + 1], 1)
+    w = GlbWriter()
+    white = w.material("white", (0.7, 0.7, 0.7))
+    lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(9.0, 9.0, 9.0))
+    sides = box_sides((-1, -0.1, -1), (1, 2, 1))
+    glow = _horizontal((-0.35, 0.35), (-0.3, 0.3), 1.99, up=False)
+    floor = Part(corners, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), material=white)
+    w.node("room", mesh=w.mesh("room", [quads_part(sides, white), floor, quads_part([glow], lamp)]))
+    return w.to_glb(), {"version": 1, "volumes": [_MIDDLE]}
+
+
+def many_lamps(emitters: int) -> Example:
+    """A closed room of 2 × 2 × 2 m with a square grid of lamps, about so many triangles; the same area of its ceiling for any number."""
+    side = max(1, round(math.sqrt(emitters / 2)))
+    step = 1.8 / side
+    edge = step * math.sqrt(0.5)
+    first = -0.9 + step * (0.5 + np.arange(side)) - edge / 2
+    glows = [_horizontal((x, x + edge), (z, z + edge), 1.99, up=False) for x in first for z in first]
+    w = GlbWriter()
+    white = w.material("white", (0.7, 0.7, 0.7))
+    lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(4.0, 4.0, 4.0))
+    w.node("room", mesh=w.mesh("room", [quads_part(box_sides((-1, 0, -1), (1, 2, 1)), white), quads_part(glows, lamp)]))
+    return w.to_glb(), {"version": 1, "volumes": [_MIDDLE]}
+
+
+# One probe in the middle of a room of 2 m.
+_MIDDLE = {"name": "room", "origin": [0.1, 0.9, -0.1], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}

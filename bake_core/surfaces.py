@@ -10,8 +10,9 @@ import math
 
 import numpy as np
 
-from bake_core.embree import intersect1, occluded1, set_ray
+from bake_core.embree import set_ray
 from bake_core.kernels import kernel
+from bake_core.ray_log import ask_any, ask_nearest
 from bake_core.textures import has_holes, lets_through
 
 # Rounding a point to float32 and intersecting in float32 each err by about an ulp of the numbers involved: leave the surface by eight.
@@ -133,7 +134,7 @@ def find_surface(t, ray, ray_bits, x, y, z, dx, dy, dz):  # type: ignore[no-unty
     """Whether a ray meets a surface, behind whatever it goes through where that is cut out; :func:`surface` then says which."""
     for _ in range(MAX_PASSED):
         set_ray(ray, ray_bits, x, y, z, dx, dy, dz, INFINITE)
-        intersect1(t.handle, ray.ctypes.data, 0)
+        ask_nearest(t, ray)
         if ray_bits[18] == INVALID:
             return False
         if not has_holes(t):
@@ -151,10 +152,10 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
     """Whether anything lies between a point and the light: any hit, or hit after hit where something in the scene is cut out."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar)
     if not has_holes(t):
-        occluded1(t.handle, ray.ctypes.data, 0)
+        ask_any(t, ray)
         return ray[8] < 0
     for _ in range(MAX_PASSED):
-        intersect1(t.handle, ray.ctypes.data, 0)
+        ask_nearest(t, ray)
         if ray_bits[18] == INVALID:
             return False
         item = ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18]

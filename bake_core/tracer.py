@@ -13,6 +13,7 @@ from bake_core.environment import Environment, Sky
 from bake_core.ggx_albedo import AlbedoTable, albedo_table
 from bake_core.lights import EmitterTable, LightTable, emitter_table, light_table, merge_lights
 from bake_core.materials import MaterialTable, gloss_table, material_table
+from bake_core.ray_log import RayLog
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
 from bake_core.textures import TextureTable, emits_unevenly, mean_emission, texture_table
@@ -35,6 +36,8 @@ class Tables(NamedTuple):
     item_first_triangle : (1 + i,) int64
     item_transform, item_normal : (1 + i, 3, 4) and (1 + i, 3, 3) float64
         Of points, and of normals up to a positive factor.
+    log : RayLog, optional
+        Where every query is written down. Kernels for tables with one are compiled apart, so that it costs the others nothing.
     """
 
     handle: np.uint64
@@ -53,6 +56,7 @@ class Tables(NamedTuple):
     environment: NDArray[np.float64]
     sky: Sky | None
     max_bounces: np.int64
+    log: RayLog | None = None
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ import math
 import numpy as np
 from numba import uint64
 
-from bake_core.embree import intersect1, set_ray
+from bake_core.embree import set_ray
 from bake_core.environment import environment_radiance, has_sky
 from bake_core.kernels import kernel
 from bake_core.materials import INV_PI, gloss, is_glossy, lambert_cosine, no_gloss, sample_gloss, sample_lambert, scattered
 from bake_core.next_event import emitter_strength, from_emitters, from_lights, from_sky, pdf_emitter
+from bake_core.ray_log import ask_nearest
 from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair
 from bake_core.surfaces import INFINITE, INVALID, MAX_PASSED, blocked, surface
 from bake_core.textures import emission_at, lets_through, reflectance, scattered_spread, widened
@@ -101,7 +102,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             ray_bits[18] = INVALID
         else:
             set_ray(ray, ray_bits, x, y, z, dx, dy, dz, INFINITE)
-            intersect1(t.handle, ray.ctypes.data, 0)
+            ask_nearest(t, ray)
         if ray_bits[18] == INVALID:
             # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
             radiance, sky_pdf = environment_radiance(t, dx, dy, dz)

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from bake_core.atlas import Layout, unpack
 from bake_core.bake import bake
-from bake_core.bench.outcome import Series
+from bake_core.bench.outcome import Series, error_against_seconds
 from bake_core.bench.peers import Peer, cannot_render, find_peers, running, work
 from bake_core.bundle import Bundle, read_bundle
+from bake_core.drawing import Drawing
 from bake_core.environment import Find
 from bake_core.errors import BakeError, InputError
 from bake_core.prepared import prepare
@@ -139,8 +140,9 @@ class Convergence:
         told += [f"{name} was left out: {why}." for name, why in self.left_out]
         return told
 
-    def series(self) -> list[Series]:
-        return [Series(c.name, [(m.seconds, m.relative_mse**0.5) for m in self.of(c.name)], self.rate(c.name)) for c in self.contestants]
+    def plot(self) -> Drawing:
+        races = [(c.name, [(m.seconds, m.relative_mse**0.5) for m in self.of(c.name)]) for c in self.contestants]
+        return error_against_seconds([Series(name, points, self.rate(name)) for name, points in races])
 
 
 class _Ours:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import os
 import platform
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,13 +27,15 @@ from bake_core.rate import Rate
 
 _WIDTH, _BOX = 720, (70.5, 30.5, 690.5, 400.5)
 _LINE_HEIGHT = 20
+# One line of JSON for every measurement that a folder has seen.
+HISTORY = "history.jsonl"
 # Okabe and Ito 2008, "Color Universal Design": told apart by colour-blind readers, too; their yellow is too pale for lines on white.
 _COLOURS: tuple[Colour, ...] = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (0, 0, 0))
 
 
 @dataclass(frozen=True)
 class Series:
-    """A curve in a plot: points of seconds and error (1 is 100 %), and the law fitted to them."""
+    """A curve in a plot: points, both coordinates above 0, and the law fitted to them."""
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -52,11 +56,13 @@ class Outcome(Protocol):
     def notes(self) -> list[str]:
         """What the numbers are, a sentence or two each."""
 
-    def series(self) -> list[Series]: ...
+    def plot(self) -> Drawing: ...
 
 
 def write(outcome: Outcome, name: str, command: str, folder: Path, page: Path | None) -> None:
     """Write ``NAME.json``, ``.csv``, ``.md``, ``.svg`` and ``.png`` into a folder, and the table into a page.
+
+    ``history.jsonl`` in the folder gets a line: when, where and with what version, and the rows of the CSV.
 
     Parameters
     ----------
@@ -70,7 +76,7 @@ def write(outcome: Outcome, name: str, command: str, folder: Path, page: Path | 
     MachineError
         ``machine.cannot_write``.
     """
-    rows, plot = outcome.rows(), error_against_seconds(outcome.series())
+    rows, plot = outcome.rows(), outcome.plot()
     sheet = io.StringIO()
     writer = csv.DictWriter(sheet, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()
@@ -87,6 +93,10 @@ def write(outcome: Outcome, name: str, command: str, folder: Path, page: Path | 
         folder.mkdir(parents=True, exist_ok=True)
         document = {"bench": name, "version": __version__, "command": command, "machine": machine, **outcome.document()}
         (folder / f"{name}.json").write_bytes(dump_json(document))
+        moment = datetime.now(UTC).isoformat(timespec="seconds")
+        entry = {"at": moment, "bench": name, "version": __version__, "command": command, "machine": machine, "rows": rows}
+        with open(folder / HISTORY, "a", encoding="utf-8") as history:
+            history.write(json.dumps(entry) + "\n")
         (folder / f"{name}.csv").write_text(sheet.getvalue(), encoding="utf-8")
         (folder / f"{name}.md").write_text(section, encoding="utf-8")
         (folder / f"{name}.svg").write_text(as_svg(plot), encoding="utf-8")
@@ -132,23 +142,34 @@ def put_section(page: str, name: str, section: str) -> str:
 
 
 def error_against_seconds(series: Sequence[Series]) -> Drawing:
-    """Curves with a legend below, both axes logarithmic; what has no error above 0 has no place on them."""
-    curves = [(s, [(x, 100 * e) for x, e in s.points if x > 0 and e > 0]) for s in series]
-    shown = [(s, points) for s, points in curves if points]
+    """Curves of error (1 is 100 %) against seconds."""
+    return curves(series, "Error against seconds", "seconds", " %", 100)
+
+
+def curves(series: Sequence[Series], title: str, across: str, unit: str = "", scale: float = 1) -> Drawing:
+    """Curves with a legend below, both axes logarithmic; what is not above 0 has no place on them.
+
+    Parameters
+    ----------
+    across, unit : str
+        What the two axes show; `scale` takes values to that unit.
+    """
+    told = [(s, [(x, scale * y) for x, y in s.points if x > 0 and y > 0]) for s in series]
+    shown = [(s, points) for s, points in told if points]
     height = int(_BOX[3]) + 66 + _LINE_HEIGHT * max(len(shown), 1)
     lines: list[Line] = []
     texts: list[Text] = []
     if not shown:
-        texts.append(Text((_WIDTH / 2, height / 2), "no error above 0 was measured", 13, INK, "middle"))
+        texts.append(Text((_WIDTH / 2, height / 2), "nothing above 0 was measured", 13, INK, "middle"))
         return Drawing(_WIDTH, height, lines, texts)
     everything = [p for _, points in shown for p in points]
-    at = log_frame(lines, texts, _BOX, ticks([x for x, _ in everything], 10), ticks([e for _, e in everything], 10), "seconds")
-    texts.append(Text((_BOX[0], 20), "Error against seconds", 15, INK, "start"))
+    at = log_frame(lines, texts, _BOX, ticks([x for x, _ in everything], 10), ticks([e for _, e in everything], 10), across, unit)
+    texts.append(Text((_BOX[0], 20), title, 15, INK, "start"))
     for i, (s, points) in enumerate(shown):
         colour = _COLOURS[i % len(_COLOURS)]
         rate = s.rate
         if rate is not None and rate.slope is not None and rate.coefficient is not None and rate.points > 1:
-            fit = [at(x, 100 * rate.coefficient * x**rate.slope) for x in (points[0][0], points[-1][0])]
+            fit = [at(x, scale * rate.coefficient * x**rate.slope) for x in (points[0][0], points[-1][0])]
             if all(_inside(p) for p in fit):
                 lines.append(Line(fit[0], fit[1], colour, 0.7))
         lines.extend(Line(at(*a), at(*b), colour, 2) for a, b in pairwise(points))

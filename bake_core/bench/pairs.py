@@ -11,8 +11,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from bake_core.bench.outcome import Series
+from bake_core.bench.outcome import Series, error_against_seconds
 from bake_core.bench.targets import Baked, Subject, bake_to, warm_up
+from bake_core.drawing import Drawing
 from bake_core.report import percent
 from bake_core.spec import OUTPUTS, Stop
 
@@ -97,8 +98,9 @@ class Pairs:
             else "Nothing was measured."
         ]
 
-    def series(self) -> list[Series]:
-        return [Series(f"{p.scene}, {s.way}", c) for p in self.pairs for s, c in zip(p.sides, p.curves, strict=True)]
+    def plot(self) -> Drawing:
+        told = [(f"{p.scene}, {s.way}", c) for p in self.pairs for s, c in zip(p.sides, p.curves, strict=True)]
+        return error_against_seconds([Series(name, points) for name, points in told])
 
 
 def when(curve: Sequence[tuple[float, float]], error: float) -> float | None:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from bake_core.bake import bake
-from bake_core.bench.outcome import Series
+from bake_core.bench.outcome import Series, error_against_seconds
+from bake_core.drawing import Drawing
 from bake_core.environment import beside
 from bake_core.rate import Rate, rate_by_seconds
 from bake_core.report import percent
@@ -142,13 +143,13 @@ class Targets:
             "against log seconds of tracing."
         ]
 
-    def series(self) -> list[Series]:
+    def plot(self) -> Drawing:
         """Of each scene the bake with the most to do."""
         longest: dict[str, Baked] = {}
         for b in self.baked:
             if b.scene not in longest or b.tracing > longest[b.scene].tracing:
                 longest[b.scene] = b
-        return [Series(b.scene, b.curve, b.rate) for b in longest.values()]
+        return error_against_seconds([Series(b.scene, b.curve, b.rate) for b in longest.values()])
 
 
 def audited(audit: dict[str, Any] | None, what: str) -> float | None:

@@ -57,6 +57,28 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         pair.add_argument("scenes", metavar="SCENE", nargs="*", type=Path, help=_SCENES)
         pair.add_argument("--target", metavar="E", type=_number(float, 0), default=0.02, help="error that both bake to; default: 0.02")
         pair.add_argument("--runs", type=positive, default=3, help="of each, in turns; default: 3")
+    speed = kinds.add_parser("throughput", parents=[shared], help="paths and rays a second, and how much of the time is Embree's")
+    speed.add_argument("scenes", metavar="SCENE", nargs="*", type=Path, help=_SCENES)
+    speed.add_argument("--runs", type=positive, default=5, help="of each, in turns; the median counts; default: 5")
+
+    growth = kinds.add_parser("scale", parents=[shared], help="what tracing costs as threads, probes, triangles and emitters grow")
+    growth.set_defaults(scenes=[])
+    growth.add_argument("--runs", type=positive, default=3, help="of each, in turns; the median counts; default: 3")
+    cores = os.cpu_count() or 1
+    grown = (
+        ("threads", sorted({1, cores}), "1 and all cores"),
+        ("probes", [64, 512, 4096], "64,512,4096"),
+        ("triangles", [1000, 10_000, 100_000, 1_000_000], "10³ to 10⁶"),
+        ("emitters", [2, 100, 10_000, 100_000], "2 to 10⁵"),
+    )
+    for axis, sizes, words in grown:
+        growth.add_argument(f"--{axis}-sizes", metavar="N,N,…", type=_numbers(int, 1), default=sizes, help=f"default: {words}")
+
+    service = kinds.add_parser("service", parents=[shared], help="what the service adds to a bake, and how soon it answers")
+    service.set_defaults(scenes=[])
+    service.add_argument("--runs", type=positive, default=3, help="of the bake each way, in turns; the median counts; default: 3")
+    service.add_argument("--bake-seconds", metavar="S", type=_number(float, 0), default=60.0, help="of the bake, about; default: 60")
+
     for limited in (errors, *pairs):
         limited.add_argument("--max-seconds", metavar="S", type=_number(float, 0), default=600.0, help="of any one bake; default: 600")
         limited.add_argument("--max-samples", metavar="N", type=positive, default=65536, help="of any one bake; default: 65536")
@@ -106,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure(args: argparse.Namespace, subjects: list[Subject], say: Callable[[str], None]) -> Outcome:
-    from bake_core.bench import convergence, pairs, targets
+    from bake_core.bench import convergence, pairs, scale, targets, throughput
     from bake_core.environment import beside
     from bake_core.errors import InputError
     from bake_core.spec import Stop
@@ -127,6 +149,15 @@ def _measure(args: argparse.Namespace, subjects: list[Subject], say: Callable[[s
             peers=args.peers,
             say=say,
         )
+    if args.kind == "service":
+        from service.cli import bench_service
+
+        return bench_service.measure(args.bake_seconds, args.runs, say)
+    if args.kind == "scale":
+        sizes = {axis: getattr(args, f"{axis}_sizes") for axis in scale.AXES}
+        return scale.measure(sizes, threads=args.threads, runs=args.runs, say=say)
+    if args.kind == "throughput":
+        return throughput.measure(subjects, threads=args.threads, runs=args.runs, say=say)
     if args.kind == "targets":
         return targets.measure(
             subjects,

@@ -5,17 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import signal
-import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-# Kernels compile at the first bake, not at the start, so this is long even for a slow disk.
-START_SECONDS = 60.0
 
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -28,6 +22,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the demo; 4 where the bake missed its target, 5 where a threshold is not kept."""
     from bake_core.examples import cornell
+    from service.cli.alone import service_alone
     from service.cli.remote import connect, exit_code, follow
 
     out: Path = args.out.absolute()
@@ -38,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     # What `kill` sends must go through `finally`, too, or the service would outlive this.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     began = time.monotonic()
-    with _service(out) as url, connect(url) as client:
+    with service_alone(out) as url, connect(url) as client:
         _say(f"service at {url}")
         scene = client.add_scene(out / "cornell.glb")
         _say(f"scene {scene.digest[:19]}…: {scene.triangles} triangles; baking it")
@@ -54,32 +49,6 @@ def run(args: argparse.Namespace) -> int:
     for picture in pictures:
         print(f"picture   {picture}")
     return exit_code(bake) or exit_code(verification)
-
-
-@contextmanager
-def _service(out: Path) -> Iterator[str]:
-    """A service on a free port that ends with this block; answers its URL."""
-    from bake_core.errors import MachineError
-
-    ready = out / "service.url"
-    ready.unlink(missing_ok=True)
-    # Whatever the environment says of a service that others reach: this one is for this command alone.
-    alone = ["--host", "127.0.0.1", "--port", "0", "--require-token", "0"]
-    command = [sys.executable, "-m", "service.cli", "serve", *alone, "--data", str(out / "data"), "--ready-file", str(ready)]
-    with open(out / "service.log", "w") as log, subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log) as process:
-        try:
-            deadline = time.monotonic() + START_SECONDS
-            while not ready.exists():
-                if process.poll() is not None or time.monotonic() > deadline:
-                    raise MachineError("demo.no_service", "the service did not start; its log says why", str(out / "service.log"))
-                time.sleep(0.05)
-            yield ready.read_text().strip()
-        finally:
-            process.terminate()
-            try:
-                process.wait(timeout=10)
-            except subprocess.TimeoutExpired:
-                process.kill()
 
 
 def _table(bundle: Path, result: dict[str, Any], report: dict[str, Any], seconds: float) -> str:

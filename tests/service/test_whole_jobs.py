@@ -282,3 +282,13 @@ def test_an_answer_does_not_wait_for_its_own_acknowledgement(server: Server) -> 
         took = sorted(http.get("/v1/bakes?limit=1").raise_for_status().elapsed.total_seconds() for _ in range(60))
     # Not the median, for the machine may be busy; not the fastest, for a connection's first segments are acknowledged at once.
     assert took[20] < 0.035
+
+
+@pytest.mark.slow
+def test_what_the_service_adds_is_measured(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = octobake("bench", "service", "-o", out, "--runs", "1", "--bake-seconds", "1", timeout=300)
+    assert done.returncode == 0, done.stderr
+    document = json.loads((out / "service.json").read_text())
+    assert len(document["accepted"]) == 50 and len(document["alone"]) == len(document["served"]) == 1
+    assert all(0 < a < b < c for a, b, c in zip(document["accepted"], document["begun"], document["done"], strict=True))

@@ -53,6 +53,29 @@ def left(out: Path, kind: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
         return document, list(csv.DictReader(f))
 
 
+def test_throughput(scene: Path) -> None:
+    """Embree alone takes no longer than all of tracing does, within what a clock can tell; rays are those of the log."""
+    document, rows = left(bench("throughput", scene, "--runs", "3", "--threads", "1"), "throughput")
+    (row,) = rows
+    assert float(row["paths"]) == 16 * float(row["probes"]) * 16**2
+    assert float(row["nearest"]) >= 1 and 0 < float(row["share_inside_embree"]) < 1.2
+    assert document["runs"] == 3
+
+
+def test_scale_and_its_history(tmp_path: Path) -> None:
+    """Exponents of costs whose sizes differ by much: a path in ten thousand triangles does not cost a hundred times one in a hundred."""
+    out = tmp_path / "out"
+    sizes = ["--threads-sizes", "1", "--probes-sizes", "1,8", "--triangles-sizes", "100,10000", "--emitters-sizes", "2,200"]
+    for _ in range(2):
+        assert main(["bench", "scale", "-o", str(out), "--runs", "1", *sizes]) == 0
+    document, rows = left(out, "scale")
+    assert [r["axis"] for r in rows] == ["threads", *(axis for axis in ("probes", "triangles", "emitters") for _ in range(2))]
+    assert abs(document["exponents"]["triangles"]["slope"]) < 0.5 and abs(document["exponents"]["emitters"]["slope"]) < 0.5
+    history = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
+    assert [entry["bench"] for entry in history] == ["scale", "scale"]
+    assert len(history[1]["rows"]) == 7 and history[1]["machine"] == document["machine"]
+
+
 def test_convergence_without_peers(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     none, kept = scene.parent / "none", scene.parent / "reference.npz"
     none.mkdir()
@@ -159,7 +182,7 @@ def test_sections_of_a_page() -> None:
 
 
 def test_a_plot_of_nothing_says_so() -> None:
-    assert "no error above 0" in as_svg(error_against_seconds([Series("a", [(1.0, 0.0)])]))
+    assert "nothing above 0" in as_svg(error_against_seconds([Series("a", [(1.0, 0.0)])]))
 
 
 def test_an_audit_in_words() -> None:

@@ -45,7 +45,7 @@ def main() -> int:
             elif part == "transfers":
                 transfers.measure(folder, args.megabytes, say)
             elif part == "overhead":
-                overhead.measure(folder, args.bake_seconds, args.rounds, say)
+                overhead.measure(args.bake_seconds, args.rounds, say)
             else:
                 mixed.measure(folder, args.minutes, say)
     # OpenImageIO's binding takes what stays frozen at the end for leaked, and says so at length.
