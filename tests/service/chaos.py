@@ -199,7 +199,7 @@ def watch_commits(database: Path) -> None:
         )
 
 
-def run(folder: Path, kills: int, seed: int) -> Figures:
+def run(folder: Path, kills: int, seed: int, every: float = KILL_SECONDS) -> Figures:
     """Kill so often, let everything finish, and check."""
     scene, _ = closed_box(0.5, 1.0)
     (folder / "box.glb").write_bytes(scene)
@@ -214,7 +214,7 @@ def run(folder: Path, kills: int, seed: int) -> Figures:
         digest = httpx.post(f"{server.url}/v1/scenes", content=scene, headers=headers, timeout=60).json()["digest"]
         clients = Clients(server, digest, seed)
         began = time.monotonic()
-        counted = _kill(server, clients.told, kills, random.Random(seed))
+        counted = _kill(server, clients.told, kills, random.Random(seed), every)
         if server.process.poll() is not None:
             server.start()
         clients.join()
@@ -225,10 +225,12 @@ def run(folder: Path, kills: int, seed: int) -> Figures:
     return check(clients.told, server.data, expected, counted, seconds)
 
 
-def _kill(server: Server, told: Histories, kills: int, chance: random.Random) -> Counter[str]:
+def _kill(server: Server, told: Histories, kills: int, chance: random.Random, every: float) -> Counter[str]:
     counted: Counter[str] = Counter()
     while counted.total() < kills:
-        time.sleep(chance.expovariate(1 / KILL_SECONDS))
+        time.sleep(chance.expovariate(1 / every))
+        if counted.total() % 50 == 0:
+            print(f"{counted.total()} kills, {len(told.acknowledged)} jobs acknowledged", file=sys.stderr, flush=True)
         if chance.random() < 0.5:
             server.bake_worker().kill()
             counted["worker"] += 1
@@ -240,8 +242,6 @@ def _kill(server: Server, told: Histories, kills: int, chance: random.Random) ->
             told.faults.append(f"outlived the service: {left}")
         # Every other one may be killed while it starts.
         server.start(wait=chance.random() < 0.5)
-        if counted.total() % 50 == 0:
-            print(f"{counted.total()} kills, {len(told.acknowledged)} jobs acknowledged", file=sys.stderr, flush=True)
     return counted
 
 
@@ -310,9 +310,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0, help="of the moments and the victims")
+    parser.add_argument("--every", type=float, default=KILL_SECONDS, metavar="SECONDS", help="between two kills, in the mean")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="octobake-chaos-") as folder:
-        figures = run(Path(folder), args.kills, args.seed)
+        figures = run(Path(folder), args.kills, args.seed, args.every)
     print(json.dumps(asdict(figures), indent=2))
     return 0 if holds(figures) else 1
 

@@ -163,11 +163,20 @@ def _bakes(process: psutil.Process) -> bool:
         return False
 
 
+def _runs(process: psutil.Process) -> bool:
+    # It may go between two questions.
+    try:
+        running: bool = process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+        return running
+    except psutil.NoSuchProcess:
+        return False
+
+
 def living(processes: list[psutil.Process], seconds: float) -> list[psutil.Process]:
     """Those that still run after so many seconds; returns as soon as none does. A zombie waits for its parent and runs no more."""
     deadline = time.monotonic() + seconds
     while True:
-        left = [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+        left = [p for p in processes if _runs(p)]
         if not left or time.monotonic() > deadline:
             return left
         time.sleep(0.005)
