@@ -81,7 +81,7 @@ class Clients:
         self.told = Histories()
         self.stopping = threading.Event()
         self._server, self._scene = server, scene
-        self._threads = [threading.Thread(target=self._live, args=(random.Random(f"{seed}-{i}"),)) for i in range(CLIENTS)]
+        self._threads = [threading.Thread(target=self._live, args=(random.Random(f"{seed}-{i}"),), daemon=True) for i in range(CLIENTS)]
         for thread in self._threads:
             thread.start()
 
