@@ -21,10 +21,11 @@ from uuid import uuid4
 
 from distributed import Client, Future, LocalCluster
 from distributed.core import Status
+from distributed.scheduler import DEFAULT_EXTENSIONS
 
 from bake_core.errors import MachineError
 from service import worker
-from service.dask_configuration import configure
+from service.dask_configuration import configure, kept
 from service.settings import Settings
 
 log = logging.getLogger("octobake.compute")
@@ -59,7 +60,13 @@ class Compute:
         try:
             if not settings.dask:
                 # Both addresses are given because the defaults are every interface, and port 8787 of it.
-                self._cluster = LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR)
+                self._cluster = LocalCluster(
+                    n_workers=0,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.ERROR,
+                    scheduler_kwargs={"extensions": kept(DEFAULT_EXTENSIONS)},
+                )
                 self._worker = _EmbeddedWorker(self._cluster.scheduler_address, settings.temporary_folder / "worker")
             self._client = Client(self._cluster or settings.dask, set_as_default=False, timeout="10s")
         except (OSError, ValueError) as e:
@@ -177,6 +184,7 @@ class _EmbeddedWorker:
         for process in (self._process, self._spare):
             if process is not None:
                 process.kill()
+                _discard(process)
 
     def _end_of_process(self) -> int:
         try:

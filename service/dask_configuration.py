@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import dask
@@ -18,6 +19,15 @@ _CONFIGURATION: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,
     "distributed.comm.timeouts.connect": "10s",
 }
+
+
+def kept(extensions: Mapping[str, type]) -> dict[str, type]:
+    """Of Dask's own extensions, those that we run with.
+
+    Spans are not among them: a task that finds no other running opens one, and all of them are kept as long as the scheduler lives, some
+    10 kB each. Our tasks run one at a time.
+    """
+    return {name: extension for name, extension in extensions.items() if name != "spans"}
 
 
 def configure() -> None:

@@ -54,8 +54,19 @@ def _hear_the_service(called: threading.Event) -> None:
 
 async def _work(scheduler: str, folder: str) -> None:
     from distributed import Worker
+    from distributed.worker import DEFAULT_EXTENSIONS
 
-    async with Worker(scheduler, nthreads=1, host="127.0.0.1", dashboard=False, memory_limit=0, local_directory=folder) as worker:
+    from service.dask_configuration import kept
+
+    async with Worker(
+        scheduler,
+        nthreads=1,
+        host="127.0.0.1",
+        dashboard=False,
+        memory_limit=0,
+        local_directory=folder,
+        extensions=kept(DEFAULT_EXTENSIONS),
+    ) as worker:
         await worker.finished()
 
 
