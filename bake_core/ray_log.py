@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.embree import intersect1, new_rayhit, occluded1, set_ray
-from bake_core.kernels import either, entry_kernel
+from bake_core.kernels import either, entry_kernel, kernel
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -44,21 +44,28 @@ def new_log(size: int) -> RayLog:
     return RayLog(np.empty((size, 8), np.float32), np.empty(size, np.uint8), np.empty(size, np.float32), np.zeros(1, np.int64))
 
 
+@kernel
+def _write_down(log, ray, kind):  # type: ignore[no-untyped-def]
+    """Note a ray before it is asked for; its place in the log, -1 where that is full."""
+    i = log.asked[0]
+    log.asked[0] += 1
+    if i >= log.rays.shape[0]:
+        return -1
+    for word in range(7):
+        log.rays[i, word] = ray[word]
+    log.rays[i, 7] = ray[8]
+    log.kinds[i] = kind
+    return i
+
+
 def _nearest(t, ray):  # type: ignore[no-untyped-def]
     intersect1(t.handle, ray.ctypes.data, 0)
 
 
 def _nearest_logged(t, ray):  # type: ignore[no-untyped-def]
-    i = t.log.asked[0]
-    t.log.asked[0] += 1
-    kept = i < t.log.rays.shape[0]
-    if kept:
-        for word in range(7):
-            t.log.rays[i, word] = ray[word]
-        t.log.rays[i, 7] = ray[8]
-        t.log.kinds[i] = NEAREST
+    i = _write_down(t.log, ray, NEAREST)
     intersect1(t.handle, ray.ctypes.data, 0)
-    if kept:
+    if i >= 0:
         t.log.found[i] = ray[8]
 
 
@@ -67,16 +74,9 @@ def _any(t, ray):  # type: ignore[no-untyped-def]
 
 
 def _any_logged(t, ray):  # type: ignore[no-untyped-def]
-    i = t.log.asked[0]
-    t.log.asked[0] += 1
-    kept = i < t.log.rays.shape[0]
-    if kept:
-        for word in range(7):
-            t.log.rays[i, word] = ray[word]
-        t.log.rays[i, 7] = ray[8]
-        t.log.kinds[i] = ANY
+    i = _write_down(t.log, ray, ANY)
     occluded1(t.handle, ray.ctypes.data, 0)
-    if kept:
+    if i >= 0:
         t.log.found[i] = ray[8]
 
 

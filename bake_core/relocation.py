@@ -16,13 +16,14 @@ best from the middle.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.embree import new_rayhit
-from bake_core.kernels import entry_kernel
+from bake_core.kernels import entry_kernel, kernel
 from bake_core.placement import Volume
 from bake_core.surfaces import blocked, find_surface, surface
 from bake_core.tracer import Tracer
@@ -31,6 +32,8 @@ F64 = NDArray[np.float64]
 
 # Of a spacing: no probe moves farther along an axis.
 FARTHEST = 0.45
+# How far to the sides the rays beside an axis go for each step along it, and by which part of its distance a wall may be off a plane there.
+_BESIDE, _FLAT = 0.25, 0.25
 
 
 def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArray[np.float32]:
@@ -49,12 +52,13 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
 
     Notes
     -----
-    A wall is what a ray along an axis meets within a spacing, from the front, or from either side where it is double-sided. What it meets
+    A wall is what a ray along an axis and four beside it meet within a spacing, in about one plane, from the front, or from either side
+    where it is double-sided. Columns and leaves are none: a probe that one of them drew would light what lies beyond it worse. What is met
     from behind says that the probe stands inside a solid, and draws it nowhere.
     """
     spacing = np.concatenate([np.broadcast_to(v.spacing, (v.probe_count, 3)) for v in volumes])
     walls = np.full((len(positions), 3, 2), np.inf)
-    _walls_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), walls)
+    _walls_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), np.empty(3), walls)
     walls[walls >= spacing[:, :, None]] = np.inf
     low, high = walls[..., 0], walls[..., 1]
     offsets = np.zeros_like(positions)
@@ -70,19 +74,36 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
     return np.where(free[:, None], offsets, 0).astype(np.float32)
 
 
+@kernel
+def _distance_to_plane(t, ray, ray_bits, p, direction, axis):  # type: ignore[no-untyped-def]
+    """How far along an axis the front of a surface lies that a ray meets, (3,) direction not unit; inf where there is none, or its back."""
+    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+    dx, dy, dz = direction[0] / length, direction[1] / length, direction[2] / length
+    if find_surface(t, ray, ray_bits, p[0], p[1], p[2], dx, dy, dz):
+        hit, _, _, _, material, front, _, _, _, _ = surface(t, ray_bits, ray, dx, dy, dz)
+        if front or t.materials.double_sided[material]:
+            return abs(hit[axis] - p[axis])
+    return np.inf
+
+
 @entry_kernel
-def _walls_kernel(t, ray, positions, walls):  # type: ignore[no-untyped-def]
-    """Distance to the nearest surface along each axis, down and up, (n, 3, 2); inf where there is none, or its back."""
+def _walls_kernel(t, ray, positions, direction, walls):  # type: ignore[no-untyped-def]
+    """Distance to the nearest wall along each axis, down and up, (n, 3, 2); inf where there is none. `direction` (3,) is to work in."""
     ray_bits = ray.view(np.uint32)
     for p in range(positions.shape[0]):
         for axis in range(3):
             for side in range(2):
-                sign = 2.0 * side - 1.0
-                dx, dy, dz = sign * (axis == 0), sign * (axis == 1), sign * (axis == 2)
-                if find_surface(t, ray, ray_bits, positions[p, 0], positions[p, 1], positions[p, 2], dx, dy, dz):
-                    hit, _, _, _, material, front, _, _, _, _ = surface(t, ray_bits, ray, dx, dy, dz)
-                    if front or t.materials.double_sided[material]:
-                        walls[p, axis, side] = abs(hit[axis] - positions[p, axis])
+                direction[:] = 0.0
+                direction[axis] = 2.0 * side - 1.0
+                straight = _distance_to_plane(t, ray, ray_bits, positions[p], direction, axis)
+                wall = straight < np.inf
+                for beside in range(4):
+                    across = (axis + 1 + beside // 2) % 3
+                    direction[across] = _BESIDE if beside % 2 else -_BESIDE
+                    wall = wall and abs(_distance_to_plane(t, ray, ray_bits, positions[p], direction, axis) - straight) <= _FLAT * straight
+                    direction[across] = 0.0
+                if wall:
+                    walls[p, axis, side] = straight
 
 
 @entry_kernel

@@ -87,17 +87,19 @@ class Retention:
     def _loop(self) -> None:
         while not self._stopping.is_set():
             try:
-                if jump := self._jump():
-                    log.warning("the clock was moved by %+.0f s: nothing is cleaned up before the next hour", jump)
-                    self._stopping.wait(CLEAN_SECONDS)
-                    continue
-                taken = self.clean()
-                counted = [len(x) for x in (taken.jobs, taken.forgotten, taken.blobs, taken.scenes)]
-                if any(counted):
-                    log.info("%d jobs expired, %d forgotten; %d files and %d scenes removed", *counted)
+                self._clean_by_the_hour()
             except Exception:
                 log.exception("a clean-up failed; the next one goes on")
             self._stopping.wait(CLEAN_SECONDS)
+
+    def _clean_by_the_hour(self) -> None:
+        if jump := self._jump():
+            log.warning("the clock was moved by %+.0f s: nothing is cleaned up before the next hour", jump)
+            return
+        taken = self.clean()
+        counted = [len(x) for x in (taken.jobs, taken.forgotten, taken.blobs, taken.scenes)]
+        if any(counted):
+            log.info("%d jobs expired, %d forgotten; %d files and %d scenes removed", *counted)
 
     def _jump(self) -> float:
         """Seconds by which the wall clock was moved since this was asked last; 0 where by few."""

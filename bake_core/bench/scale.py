@@ -17,7 +17,7 @@ from bake_core.bench.throughput import SAMPLES, seconds_of, trace_once
 from bake_core.drawing import Drawing
 from bake_core.examples import many_lamps, rough_floor
 from bake_core.prepared import prepare
-from bake_core.rate import Rate, rate_of_runs
+from bake_core.rate import Rate, in_words, rate_of_runs
 from bake_core.scene_files import load_scene
 from bake_core.spec import Spec, parse_spec
 
@@ -49,6 +49,10 @@ class Scale:
     costs: tuple[Cost, ...]
     runs: int
 
+    def axes(self) -> list[str]:
+        """Those that were measured."""
+        return list(dict.fromkeys(c.axis for c in self.costs))
+
     def of(self, axis: str) -> list[Cost]:
         return [c for c in self.costs if c.axis == axis]
 
@@ -58,8 +62,7 @@ class Scale:
         return rate_of_runs([float(c.size) for c in some], [c.cost for c in some])
 
     def document(self) -> dict[str, Any]:
-        axes = dict.fromkeys(c.axis for c in self.costs)
-        return {**asdict(self), "exponents": {axis: asdict(self.exponent(axis)) for axis in axes}}
+        return {**asdict(self), "exponents": {axis: asdict(self.exponent(axis)) for axis in self.axes()}}
 
     def rows(self) -> list[dict[str, Any]]:
         return [asdict(c) | {"unit": _COSTS[c.axis]} for c in self.costs]
@@ -69,9 +72,7 @@ class Scale:
         rows: list[tuple[str, ...]] = [("what grows", "size", "cost", "times the first", "exponent")]
         for c in self.costs:
             some = self.of(c.axis)
-            rate = self.exponent(c.axis)
-            spread = "" if rate.standard_error is None else f" ± {rate.standard_error:.2f}"
-            slope = f"{rate.slope:.2f}{spread}" if c is some[-1] and rate.slope is not None else ""
+            slope = in_words(self.exponent(c.axis)) if c is some[-1] else ""
             rows.append((c.axis, f"{c.size:,}", f"{c.cost:.3g} {_COSTS[c.axis]}", f"{c.cost / some[0].cost:.2f}", slope))
         return rows
 
@@ -85,7 +86,7 @@ class Scale:
     def plot(self) -> Drawing:
         """Cost over that of the first size."""
         series = []
-        for axis in dict.fromkeys(c.axis for c in self.costs):
+        for axis in self.axes():
             some = self.of(axis)
             series.append(Series(axis, [(c.size, c.cost / some[0].cost) for c in some]))
         return curves(series, "Cost against size", "size", "×")

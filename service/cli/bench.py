@@ -26,12 +26,14 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("bench", help="measure error against run time, beside other renderers; what adapting and leaving out save")
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
 
-    shared = argparse.ArgumentParser(add_help=False)
+    written = argparse.ArgumentParser(add_help=False)
+    written.add_argument("-o", "--out", metavar="DIR", type=Path, required=True, help="KIND.json, .csv, .md, .svg and .png go here")
+    written.add_argument("--markdown", metavar="FILE", type=Path, help="also put the table into this page, between its two marks")
+    written.add_argument("--json", action="store_true", help="print what was measured as one JSON document")
+    threaded = argparse.ArgumentParser(add_help=False, parents=[written])
+    threaded.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
+    shared = argparse.ArgumentParser(add_help=False, parents=[threaded])
     shared.add_argument("--spec", metavar="SPEC", type=Path, help="a JSON file, or a folder with NAME.json for each scene NAME")
-    shared.add_argument("-o", "--out", metavar="DIR", type=Path, required=True, help="KIND.json, .csv, .md, .svg and .png go here")
-    shared.add_argument("--markdown", metavar="FILE", type=Path, help="also put the table into this page, between its two marks")
-    shared.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
-    shared.add_argument("--json", action="store_true", help="print what was measured as one JSON document")
 
     race = kinds.add_parser(
         "convergence", parents=[shared], help="error against run time of ours and of Mitsuba and Cycles where installed"
@@ -61,8 +63,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     speed.add_argument("scenes", metavar="SCENE", nargs="*", type=Path, help=_SCENES)
     speed.add_argument("--runs", type=positive, default=5, help="of each, in turns; the median counts; default: 5")
 
-    growth = kinds.add_parser("scale", parents=[shared], help="what tracing costs as threads, probes, triangles and emitters grow")
-    growth.set_defaults(scenes=[])
+    growth = kinds.add_parser("scale", parents=[threaded], help="what tracing costs as threads, probes, triangles and emitters grow")
     growth.add_argument("--runs", type=positive, default=3, help="of each, in turns; the median counts; default: 3")
     cores = os.cpu_count() or 1
     grown = (
@@ -74,8 +75,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     for axis, sizes, words in grown:
         growth.add_argument(f"--{axis}-sizes", metavar="N,N,…", type=_numbers(int, 1), default=sizes, help=f"default: {words}")
 
-    service = kinds.add_parser("service", parents=[shared], help="what the service adds to a bake, and how soon it answers")
-    service.set_defaults(scenes=[])
+    service = kinds.add_parser("service", parents=[written], help="what the service adds to a bake, and how soon it answers")
     service.add_argument("--runs", type=positive, default=3, help="of the bake each way, in turns; the median counts; default: 3")
     service.add_argument("--bake-seconds", metavar="S", type=_number(float, 0), default=60.0, help="of the bake, about; default: 60")
 
@@ -114,8 +114,7 @@ def run(args: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(f"[{time.perf_counter() - began:6.1f} s] {line}", file=sys.stderr, flush=True)
 
-    with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder:
-        found = _measure(args, _subjects(args, Path(folder)), say)
+    found = _measure(args, say)
     command = shlex.join(["octobake", *(args.argv if hasattr(args, "argv") else sys.argv[1:])])
     outcome.write(found, args.kind, command, args.out, args.markdown)
     if args.json:
@@ -127,8 +126,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _measure(args: argparse.Namespace, subjects: list[Subject], say: Callable[[str], None]) -> Outcome:
-    from bake_core.bench import convergence, pairs, scale, targets, throughput
+def _measure(args: argparse.Namespace, say: Callable[[str], None]) -> Outcome:
+    if args.kind == "service":
+        from service.cli import bench_service
+
+        return bench_service.measure(args.bake_seconds, args.runs, say)
+    if args.kind == "scale":
+        from bake_core.bench import scale
+
+        sizes = {axis: getattr(args, f"{axis}_sizes") for axis in scale.AXES}
+        return scale.measure(sizes, threads=args.threads, runs=args.runs, say=say)
+    with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder:
+        return _measure_scenes(args, _subjects(args, Path(folder)), say)
+
+
+def _measure_scenes(args: argparse.Namespace, subjects: list[Subject], say: Callable[[str], None]) -> Outcome:
+    from bake_core.bench import convergence, pairs, targets, throughput
     from bake_core.environment import beside
     from bake_core.errors import InputError
     from bake_core.spec import Stop
@@ -149,13 +162,6 @@ def _measure(args: argparse.Namespace, subjects: list[Subject], say: Callable[[s
             peers=args.peers,
             say=say,
         )
-    if args.kind == "service":
-        from service.cli import bench_service
-
-        return bench_service.measure(args.bake_seconds, args.runs, say)
-    if args.kind == "scale":
-        sizes = {axis: getattr(args, f"{axis}_sizes") for axis in scale.AXES}
-        return scale.measure(sizes, threads=args.threads, runs=args.runs, say=say)
     if args.kind == "throughput":
         return throughput.measure(subjects, threads=args.threads, runs=args.runs, say=say)
     if args.kind == "targets":

@@ -93,7 +93,9 @@ def test_a_store_that_refuses_is_told_before_an_answer_has_begun(
     assert http.head(f"/v1/blobs/{named(other)}").status_code == 404
     assert http.put(f"/v1/blobs/{named(other)}", content=other).status_code == 201
     assert http.get(f"/v1/bakes/{job.id}/bundle").content == data
-    assert not list((service.settings.data_folder / "blobs").rglob("*.part")), blob_key(made)
+    assert service.blobs.root is not None
+    kept = [path.relative_to(service.blobs.root).as_posix() for path in service.blobs.root.rglob("*") if path.is_file()]
+    assert sorted(kept) == sorted(blob_key(digest) for digest in (made, named(other)))
 
 
 def write(path: Path, data: bytes) -> Path:

@@ -81,3 +81,13 @@ def test_probes_stay_where_light_on_surfaces_is_not_what_they_are_for() -> None:
         assert prepare(load_example(glb), spec).offsets.any() == moves
     single = {**document["volumes"][0], "counts": [1, 1, 1]}
     assert not prepare(load_example(glb), parse_spec({**document, "volumes": [single]})).offsets.any()
+
+
+def test_a_column_is_no_wall() -> None:
+    """Half a cell off and thinner than a quarter of that: it draws nobody, where a wall in its place does."""
+    for half, expected in ((0.1, 0.0), (9.0, MOVED)):
+        w = GlbWriter()
+        column = w.material("column", (0.5,) * 3)
+        w.node("box", mesh=w.mesh("box", [quads_part(box_sides((0.5, -9, -half), (0.7, 9, half)), column, outwards=True)]))
+        found = moved(w.to_glb(), origin=[0, 0, 0], spacing=[1, 1, 1], counts=[1, 1, 1])
+        np.testing.assert_allclose(found[0], [expected, 0, 0], atol=1e-5)
