@@ -22,6 +22,7 @@ from bake_core.gloss_levels import gloss_alphas
 from bake_core.images import write_exr
 from bake_core.parameters import PARAMETERS, Choice, default_choices
 from bake_core.placement import Volume
+from bake_core.relocation_trial import Trial
 from bake_core.selection import LeftOut, Selection
 from bake_core.shader_constants import bundle_constants, probe_texels
 from bake_core.shader_files import shader_dir
@@ -56,6 +57,7 @@ def assemble(
     spec: Spec,
     volumes: tuple[Volume, ...],
     offsets: F32,
+    trials: Sequence[Trial | None],
     selection: Selection,
     left_out: tuple[LeftOut, ...],
     state: State,
@@ -69,6 +71,8 @@ def assemble(
     ----------
     offsets : (n, 3) float32
         Of all volumes' probes in turn from their lattice points, metres.
+    trials : sequence of Trial or None
+        What was measured of each volume to decide on them.
     left_out : tuple of LeftOut
         Outputs and all else.
     choose : callable
@@ -91,9 +95,9 @@ def assemble(
         packed.append(_pack(volume, offsets[probes], selection.of(index), selection, state, probes, whole=whole))
         first += volume.probe_count
     entries, data, saved = [], [], np.zeros(2, np.int64)
-    for (content, described), choice in zip(packed, choose([p.content for p in packed]), strict=True):
+    for (content, described), choice, trial in zip(packed, choose([p.content for p in packed]), trials, strict=True):
         content = replace(content, parameters=choice.parameters)
-        entries.append(_write(content, described, choice, folder))
+        entries.append(_write(content, described, choice, trial, folder))
         data.append(content)
         size = sum(a.tile**2 * len(CHANNELS[a.output]) * _BYTES[a.encoding] for a in content.atlases.values())
         saved += np.array([(content.states == left_out_as).sum() * size for left_out_as in (0, 2)])
@@ -247,7 +251,7 @@ def _pack(
     return _Packed(content, described)
 
 
-def _write(volume: VolumeData, described: list[dict[str, Any]], choice: Choice, folder: Path) -> dict[str, Any]:
+def _write(volume: VolumeData, described: list[dict[str, Any]], choice: Choice, trial: Trial | None, folder: Path) -> dict[str, Any]:
     """A volume's files, and its entry in the manifest."""
     for entry in described:
         if entry["file"] is not None:
@@ -271,6 +275,7 @@ def _write(volume: VolumeData, described: list[dict[str, Any]], choice: Choice, 
             "active": int((volume.states == 1).sum()),
             "states": volume.states.tolist(),
             "offsets": [[float(str(x)) for x in offset] for offset in volume.offsets] if volume.offsets.any() else None,
+            "tried": trial and {"points": trial.points, "error": trial.error, "lattice_error": trial.lattice_error},
             # Shortest decimals of the float32 values.
             "backface": [float(str(b)) for b in volume.backface],
         },

@@ -184,6 +184,7 @@ def finish(
                 prepared.spec,
                 prepared.volumes,
                 prepared.offsets,
+                prepared.trials,
                 prepared.selection,
                 prepared.left_out,
                 state,
@@ -270,7 +271,7 @@ def bake(
     clock.stage("reading")
     scene = load_scene(scene_path)
     clock.stage("building")
-    prepared = prepare(scene, spec, find)
+    prepared = prepare(scene, spec, find, threads=threads)
     clock.stage("compiling")
     compile_kernels(prepared, audited=audit_seconds != 0)
     clock.stage("tracing")

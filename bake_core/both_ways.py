@@ -77,7 +77,7 @@ def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -
     SpecError, SceneError
         As a bake would.
     """
-    without, ours = _bake(prepare(scene, spec, find), threads)
+    without, ours = _bake(prepare(scene, spec, find, threads=threads), threads)
     with_all, theirs = _bake(everything(scene, spec, find), threads)
     # Of probes that one bake has and the other has not there is nothing to compare.
     kept = [(a.states == 1) & (b.states == 1) for a, b in zip(ours, theirs, strict=True)]

@@ -108,7 +108,7 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
     # As a bake chooses it: a power of two above any distance.
     miss = 2.0 ** math.ceil(math.log2(4 * max(longest, 1e-6)))
     state.distance[~np.isfinite(state.distance)] = miss
-    offsets = np.zeros((len(state.backface), 3), np.float32)
+    offsets, untried = np.zeros((len(state.backface), 3), np.float32), [None] * len(volumes)
     sides = {"irradiance": r.irradiance, "visibility": r.visibility, "distance": r.distance, "normal": r.normal}
     selection = Selection(OUTPUTS, (False,) * len(volumes), (), capture=radiance, miss_distance=miss, **sides)
     source = _Source(f"sha256:{digest.hexdigest()}", 0, ())
@@ -116,7 +116,7 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as work:
             target = Path(work) / "bundle"
             target.mkdir()
-            manifest = assemble(source, spec, volumes, offsets, selection, (), state, "samples", target) | {"samples": 0}
+            manifest = assemble(source, spec, volumes, offsets, untried, selection, (), state, "samples", target) | {"samples": 0}
             written = bundle.dump_json(manifest)
             (target / bundle.MANIFEST).write_bytes(written)
             report.write(target, manifest, bundle.content_digest(written), Run(1, 1, stopped="samples"))

@@ -19,6 +19,7 @@ from bake_core.shader_constants import finest_first, probe_texels, surface_bias
 
 if TYPE_CHECKING:
     from bake_core.bundle import Atlas, VolumeData
+    from bake_core.placement import Volume
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -158,7 +159,7 @@ def covered(volumes: Sequence[VolumeData], positions: ArrayLike) -> NDArray[np.b
     return out
 
 
-def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
+def cell(volume: VolumeData | Volume, positions: F64) -> tuple[I64, F64]:
     """The cell around each point, the nearest one where it is outside. Mirrors ``obCell``.
 
     Returns
@@ -168,7 +169,7 @@ def cell(volume: VolumeData, positions: F64) -> tuple[I64, F64]:
     fraction : (n, 3) float64
         In [0, 1], how far through the cell the point is; 0 along an axis with one probe.
     """
-    last = volume.counts - 1
+    last = np.asarray(volume.counts) - 1
     g = np.clip((positions - volume.origin) / volume.spacing, 0, last)
     base = np.minimum(np.floor(g), np.maximum(last - 1, 0)).astype(np.int64)
     return base, g - base

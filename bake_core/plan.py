@@ -138,7 +138,7 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     SpecError, SceneError
         As the bake would.
     """
-    prepared = prepare(scene, spec, find)
+    prepared = prepare(scene, spec, find, threads=threads)
     compile_kernels(prepared, audited=False)
     check_finite(prepared, threads=threads)
     pilot = trace_pilot(prepared, threads)

@@ -13,6 +13,7 @@ from bake_core.parameters import LARGEST
 from bake_core.placement import Volume, place
 from bake_core.reach import probes_about_surfaces
 from bake_core.relocation import relocate
+from bake_core.relocation_trial import Trial, try_relocation
 from bake_core.scene import Scene
 from bake_core.sealed import is_sealed
 from bake_core.selection import LeftOut, Selection, select
@@ -34,6 +35,8 @@ class Prepared:
         By how much they were moved from their lattice points.
     limits, units : (n,) float64
         Each probe's distance limit, and the smallest spacing of its volume, metres.
+    trials : tuple of Trial or None
+        Each volume's, where it was to be found out whether its probes should move.
     needed : (n,) bool
         Which of them are baked at all, unless they turn out to stand inside a solid.
     tracer : Tracer
@@ -50,6 +53,7 @@ class Prepared:
     whole: Tracer
     positions: NDArray[np.float64]
     offsets: NDArray[np.float32]
+    trials: tuple[Trial | None, ...]
     limits: NDArray[np.float64]
     units: NDArray[np.float64]
     needed: NDArray[np.bool_]
@@ -64,11 +68,13 @@ class Prepared:
         return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
 
 
-def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
+def prepare(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 1) -> Prepared:
     """Place the probes, choose the outputs, build the acceleration structure.
 
     Parameters
     ----------
+    threads : int
+        The result is the same for any number.
     find : callable, optional
         Where an image that the spec names lies; in what is prepared it is named by its digest.
 
@@ -81,14 +87,13 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
     spec = spec.model_copy(update={"environment": named})
     positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
     whole = Tracer.build(scene, spec, environment)
-    moves = [spec.relocates(v.probe_count) for v in volumes]
-    offsets = np.zeros(positions.shape, np.float32)
-    if any(moves):
-        offsets = relocate(whole, volumes, positions)
-        offsets[~np.repeat(moves, [v.probe_count for v in volumes])] = 0
-        positions = positions + offsets
-    stand = np.split(positions, np.cumsum([v.probe_count for v in volumes])[:-1])
-    stand = [s if moved else _corners(v) - scene.origin for v, moved, s in zip(volumes, moves, stand, strict=True)]
+    offsets, trials = _relocated(scene, spec, whole, volumes, positions, threads)
+    positions = positions + offsets
+    edges = np.cumsum([v.probe_count for v in volumes])[:-1]
+    stand = [
+        s if own.any() else _corners(v) - scene.origin
+        for v, s, own in zip(volumes, np.split(positions, edges), np.split(offsets, edges), strict=True)
+    ]
     selection = select(scene, spec, volumes, stand)
     shines = environment.sky is not None or bool(environment.constant.any())
     return Prepared(
@@ -100,10 +105,32 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
         whole=whole,
         positions=positions,
         offsets=offsets,
+        trials=trials,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
         units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
         needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
     )
+
+
+def _relocated(
+    scene: Scene, spec: Spec, tracer: Tracer, volumes: Sequence[Volume], positions: NDArray[np.float64], threads: int
+) -> tuple[NDArray[np.float32], tuple[Trial | None, ...]]:
+    """Offsets of all volumes' probes in turn, and what was measured to decide on them."""
+    offsets = np.zeros(positions.shape, np.float32)
+    trials: list[Trial | None] = [None] * len(volumes)
+    may = [spec.relocates(v.probe_count) for v in volumes]
+    if any(may):
+        found = relocate(tracer, volumes, positions)
+        first = 0
+        for i, volume in enumerate(volumes):
+            own = slice(first, first + volume.probe_count)
+            first = own.stop
+            if may[i] and spec.probes == "auto" and found[own].any():
+                trials[i] = try_relocation(scene, tracer, volume, found[own].astype(np.float64), 1 / len(volumes), threads=threads)
+            trial = trials[i]
+            if may[i] and (trial is None or trial.moved):
+                offsets[own] = found[own]
+    return offsets, tuple(trials)
 
 
 def _corners(volume: Volume) -> NDArray[np.float64]:

@@ -52,22 +52,26 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
 
     Notes
     -----
-    A wall is what a ray along an axis and four beside it meet within a spacing, in about one plane, from the front, or from either side
-    where it is double-sided. Columns and leaves are none: a probe that one of them drew would light what lies beyond it worse. What is met
-    from behind says that the probe stands inside a solid, and draws it nowhere.
+    A wall is what a ray along an axis meets within a spacing, from the front or from either side where it is double-sided, and rays beside
+    it in about the same plane: one of two across, and one of two the other way across, for probes stand near corners, too. Columns and
+    leaves are none and draw nobody, but a probe between one and a wall stands in the middle. What is met from behind says that the probe
+    stands inside a solid, and draws it nowhere.
     """
     spacing = np.concatenate([np.broadcast_to(v.spacing, (v.probe_count, 3)) for v in volumes])
-    walls = np.full((len(positions), 3, 2), np.inf)
-    _walls_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), np.empty(3), walls)
-    walls[walls >= spacing[:, :, None]] = np.inf
-    low, high = walls[..., 0], walls[..., 1]
+    met = np.empty((len(positions), 3, 2, 5))
+    _meet_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), np.empty(3), met)
+    straight = np.where(met[..., 0] < spacing[:, :, None], met[..., 0], np.inf)
+    anything = np.isfinite(straight)
+    # In the first place, so that no inf is taken from another.
+    ahead = np.where(anything, straight, 0)
+    flat = np.abs(met[..., 1:] - ahead[..., None]) <= _FLAT * ahead[..., None]
+    wall = anything & flat.reshape(*flat.shape[:-1], 2, 2).any(-1).all(-1)
     offsets = np.zeros_like(positions)
-    for near, far, sign in ((high, low, 1), (low, high, -1)):
-        alone = np.isfinite(near) & ~np.isfinite(far)
-        d = np.where(alone, near, 0)
-        offsets += np.where(alone, sign * 3 * d * (d + spacing) / (6 * d + 5 * spacing), 0)
-    between = np.isfinite(low) & np.isfinite(high)
-    offsets[between] = (high[between] - low[between]) / 2
+    for side, sign in ((0, -1), (1, 1)):
+        d = np.where(wall[..., side] & ~anything[..., 1 - side], ahead[..., side], 0)
+        offsets += sign * 3 * d * (d + spacing) / (6 * d + 5 * spacing)
+    between = anything.all(-1) & wall.any(-1)
+    offsets[between] = (ahead[..., 1] - ahead[..., 0])[between] / 2
     offsets = np.clip(offsets, -FARTHEST * spacing, FARTHEST * spacing)
     free = np.ones(len(positions), np.bool_)
     _free_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), np.ascontiguousarray(offsets), free)
@@ -87,23 +91,20 @@ def _distance_to_plane(t, ray, ray_bits, p, direction, axis):  # type: ignore[no
 
 
 @entry_kernel
-def _walls_kernel(t, ray, positions, direction, walls):  # type: ignore[no-untyped-def]
-    """Distance to the nearest wall along each axis, down and up, (n, 3, 2); inf where there is none. `direction` (3,) is to work in."""
+def _meet_kernel(t, ray, positions, direction, met):  # type: ignore[no-untyped-def]
+    """What rays along each axis, down and up, and the four beside each meet, as :func:`_distance_to_plane`, (n, 3, 2, 5)."""
     ray_bits = ray.view(np.uint32)
     for p in range(positions.shape[0]):
         for axis in range(3):
             for side in range(2):
                 direction[:] = 0.0
                 direction[axis] = 2.0 * side - 1.0
-                straight = _distance_to_plane(t, ray, ray_bits, positions[p], direction, axis)
-                wall = straight < np.inf
+                met[p, axis, side, 0] = _distance_to_plane(t, ray, ray_bits, positions[p], direction, axis)
                 for beside in range(4):
                     across = (axis + 1 + beside // 2) % 3
                     direction[across] = _BESIDE if beside % 2 else -_BESIDE
-                    wall = wall and abs(_distance_to_plane(t, ray, ray_bits, positions[p], direction, axis) - straight) <= _FLAT * straight
+                    met[p, axis, side, 1 + beside] = _distance_to_plane(t, ray, ray_bits, positions[p], direction, axis)
                     direction[across] = 0.0
-                if wall:
-                    walls[p, axis, side] = straight
 
 
 @entry_kernel

@@ -159,6 +159,14 @@ def chosen_in_words(parameters: dict[str, float], chosen: dict[str, Any]) -> str
     return f"bias {bias:g}, floor {floor:g}, fade {fade:g}: {measured}" + ("" if here == default else f", {default} by default")
 
 
+def places_in_words(probes: dict[str, Any]) -> str:
+    """What a manifest says of where a volume's probes stand, and what that was decided by."""
+    tried, moved = probes["tried"], probes["offsets"] is not None
+    error, other = (percent(max(tried[k], 0.0) ** 0.5) for k in (("error", "lattice_error") if moved else ("lattice_error", "error")))
+    where, elsewhere = ("nearer to walls", "on the lattice") if moved else ("on the lattice", "nearer to walls")
+    return f"{where}: error {error} at {tried['points']} points on surfaces, {other} {elsewhere}"
+
+
 def audit_in_words(audit: Audit) -> str:
     """One line: what was looked at, and what came of it."""
     said = []

@@ -323,7 +323,7 @@ def _prepared(work: Work) -> Prepared:
             # A job with a limit is not charged for the scenes of others.
             while len(_cache) >= (work.cached_scenes if work.memory_bytes is None else 1):
                 _cache.popitem(last=False)
-            _cache[key] = prepare_bake(scene, parse_spec(work.spec), find_stored(stored))
+            _cache[key] = prepare_bake(scene, parse_spec(work.spec), find_stored(stored), threads=work.own_threads)
         _cache.move_to_end(key)
         return _cache[key]
 

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
     from bake_core.rate import Rate, in_words
-    from bake_core.report import audit_in_words, audit_of, chosen_in_words, percent
+    from bake_core.report import audit_in_words, audit_of, chosen_in_words, percent, places_in_words
     from service.cli.plan import left_out_lines
     from service.cli.progress import count
 
@@ -52,6 +52,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         for a in v["atlases"]:
             cost, file = percent(a["encoding_error"]), a["file"] or "no file, all texels are the same"
             lines.append(f"  {a['output']:<11}{a['interior']}² texels, stored as {a['encoding']}, which costs {cost}: {file}")
+        if probes.get("tried") is not None:
+            lines.append(f"  {'places':<11}{places_in_words(probes)}")
         if v.get("chosen") is not None:
             lines.append(f"  {'weights':<11}{chosen_in_words(v['parameters'], v['chosen'])}")
     lines += left_out_lines(manifest["left_out"])

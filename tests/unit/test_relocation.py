@@ -14,6 +14,7 @@ from bake_core.prepared import prepare
 from bake_core.relocation import FARTHEST
 from bake_core.spec import parse_spec
 from tests.baking import bake_example
+from tests.scenes import add_square, load
 from tests.unit.test_transport import load_example
 
 # Of a spacing, of a probe half a spacing from a wall.
@@ -91,3 +92,39 @@ def test_a_column_is_no_wall() -> None:
         w.node("box", mesh=w.mesh("box", [quads_part(box_sides((0.5, -9, -half), (0.7, 9, half)), column, outwards=True)]))
         found = moved(w.to_glb(), origin=[0, 0, 0], spacing=[1, 1, 1], counts=[1, 1, 1])
         np.testing.assert_allclose(found[0], [expected, 0, 0], atol=1e-5)
+
+
+def grey_cube(lamp_height: float) -> bytes:
+    """Of 2 m, with a lamp of 1.6 m that faces down."""
+    w = GlbWriter()
+    w.node("room", mesh=w.mesh("room", [quads_part(box_sides((-1, -1, -1), (1, 1, 1)), w.material("wall", (0.6,) * 3))]))
+    matrix = np.diag([0.8, -1.0, 0.8, 1.0])
+    matrix[1, 3] = lamp_height
+    add_square(w, "lamp", (0, 0, 0), matrix=matrix, emission=(5.0, 5.0, 5.0))
+    return w.to_glb()
+
+
+def test_probes_stay_on_a_lattice_that_is_measured_to_be_better(tmp_path: Path) -> None:
+    """Beside a lamp 1 cm below the ceiling light bends within the cell; in two rooms it does not. The bundle has both figures."""
+    grid = {"origin": [-0.9] * 3, "spacing": [0.6] * 3, "counts": [4] * 3}
+    room = (grey_cube(0.99), {"version": 1, "volumes": [grid]})
+    for example, moves in ((room, False), (two_rooms(), True)):
+        (volume,) = bake_example(tmp_path, example, stop={"target_error": None, "max_samples": 4}).manifest["volumes"]
+        tried = volume["probes"]["tried"]
+        assert (volume["probes"]["offsets"] is not None) == moves == (tried["error"] < tried["lattice_error"])
+        assert tried["points"] == 1024
+
+
+def test_what_is_measured_does_not_depend_on_threads() -> None:
+    glb, document = two_rooms()
+    scene, spec = load_example(glb), parse_spec(document)
+    assert prepare(scene, spec, threads=1).trials == prepare(scene, spec, threads=2).trials
+
+
+def test_where_no_light_is_nothing_is_measured() -> None:
+    """In the dark probes go to the walls, as they do without measuring."""
+    w = GlbWriter()
+    w.node("room", mesh=w.mesh("room", [quads_part(box_sides((-1, -1, -1), (1, 1, 1)), w.material("wall", (0.6,) * 3))]))
+    spec = parse_spec({"version": 1, "volumes": [{"origin": [-0.5] * 3, "spacing": [1.0] * 3, "counts": [2] * 3}]})
+    prepared = prepare(load(w), spec)
+    assert prepared.trials == (None,) and prepared.offsets.all()
