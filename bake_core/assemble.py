@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bake_core import __version__
 from bake_core.allocation import SCRAMBLES
-from bake_core.atlas import choose_encoding, layout, pack
+from bake_core.atlas import Layout, choose_encoding, layout, pack
 from bake_core.bundle import CHANNELS, FORMAT, SHADERS, VERSION, Atlas, VolumeData, digest_file
 from bake_core.convergence import Verdict
 from bake_core.embree import instruction_set
@@ -29,6 +29,7 @@ from bake_core.shader_files import shader_dir
 from bake_core.spec import OutputName, Spec
 from bake_core.tally import State
 from bake_core.volume_chains import CHAINS, chain_levels, chain_size, traceable, volume_chain
+from bake_core.walls import coarser
 
 F32 = NDArray[np.float32]
 
@@ -63,7 +64,7 @@ def assemble(
     state: State,
     stopped: Verdict,
     folder: Path,
-    choose: Callable[[Sequence[VolumeData]], list[Choice]] = default_choices,
+    choose: Callable[[Sequence[Sequence[VolumeData]]], list[Choice]] = default_choices,
 ) -> dict[str, Any]:
     """Write atlases and shaders into a folder.
 
@@ -76,7 +77,7 @@ def assemble(
     left_out : tuple of LeftOut
         Outputs and all else.
     choose : callable
-        What each volume's query uses, by the volumes as they will be read.
+        What each volume's query uses, by the volumes as they may be read: each once for each resolution of its visibility.
 
     Returns
     -------
@@ -95,7 +96,9 @@ def assemble(
         packed.append(_pack(volume, offsets[probes], selection.of(index), selection, state, probes, whole=whole))
         first += volume.probe_count
     entries, data, saved = [], [], np.zeros(2, np.int64)
-    for (content, described), choice, trial in zip(packed, choose([p.content for p in packed]), trials, strict=True):
+    choices = choose([[p.content for p in ways] for ways in packed])
+    for ways, choice, trial in zip(packed, choices, trials, strict=True):
+        content, described = ways[choice.resolution]
         content = replace(content, parameters=choice.parameters)
         entries.append(_write(content, described, choice, trial, folder))
         data.append(content)
@@ -196,46 +199,16 @@ def _pack(
     probes: slice,
     *,
     whole: bool,
-) -> _Packed:
-    """Choose encodings and lay out atlases; `whole` maps have a file and all channels."""
+) -> list[_Packed]:
+    """Choose encodings and lay out atlases, once for each resolution of visibility; `whole` maps have a file and all channels."""
     active = state.active()[probes]
     kept = np.flatnonzero(active)
     maps: dict[str, F32] = {output: _interior(output, selection, state, probes)[kept] for output in outputs}
-    if "visibility" in maps:
-        maps["visibility"], maps["walls"] = maps["visibility"][..., :2], maps["visibility"][..., 2:]
-    tiles = [m.shape[1] + 2 for m in maps.values()]
-    shape = layout(volume.counts, max(tiles), len(kept))
-    atlases: dict[str, Atlas] = {}
-    described = []
-    for output, interior in maps.items():
-        if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
-            bad = int(kept[np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0]])
-            raise BakeError(
-                "bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume.name}: probe {bad}"
-            )
-        encoding, cost = ("float", 0.0) if output in _ALWAYS_FULL else choose_encoding(interior)
-        atlas = Atlas(
-            output, pack(interior, shape), interior.shape[1] + 2, interior.shape[1], shape.columns, shape.rows, shape.layers, encoding
-        )
-        entry: dict[str, Any] = {
-            "output": output,
-            "file": f"{volume.name}.{output}.exr",
-            "encoding": encoding,
-            "encoding_error": cost,
-            "channels": list(CHANNELS[output]),
-            "tile": atlas.tile,
-            "interior": atlas.interior,
-        }
-        if not whole and len(kept) and (interior == interior[0, 0, 0]).all():
-            stored = interior[0, 0, 0].astype(np.float16 if encoding == "half" else np.float32)
-            entry |= {"file": None, "constant": [float(str(x)) for x in stored]}
-        elif not whole and entry["channels"] == ["R", "G", "B"] and (interior == interior[..., :1]).all():
-            entry["channels"] = ["Y"] * 3
-        if output == "distance":
-            entry["miss"] = selection.miss_distance
-            atlas = replace(atlas, miss=selection.miss_distance)
-        atlases[output] = atlas
-        described.append(entry)
+    seen = maps.get("visibility")
+    if seen is not None:
+        maps["visibility"], maps["walls"] = seen[..., :2], seen[..., 2:]
+    shape = layout(volume.counts, max(m.shape[1] + 2 for m in maps.values()), len(kept))
+    laid = {output: _lay(volume.name, output, interior, shape, kept, selection, whole) for output, interior in maps.items()}
     content = VolumeData(
         name=volume.name,
         origin=volume.origin,
@@ -246,9 +219,51 @@ def _pack(
         backface=state.backface[probes],
         parameters=PARAMETERS,
         distance_limit=volume.distance_limit,
-        atlases=atlases,
+        atlases={},
     )
-    return _Packed(content, described)
+    packed = [_packed(content, laid)]
+    if seen is None:
+        return packed
+    for side in selection.coarser:
+        fewer = coarser(seen, side)
+        for output, interior in (("visibility", fewer[..., :2]), ("walls", fewer[..., 2:])):
+            laid = laid | {output: _lay(volume.name, output, interior, shape, kept, selection, whole)}
+        packed.append(_packed(content, laid))
+    return packed
+
+
+def _packed(content: VolumeData, laid: dict[str, tuple[Atlas, dict[str, Any]]]) -> _Packed:
+    return _Packed(replace(content, atlases={o: atlas for o, (atlas, _) in laid.items()}), [entry for _, entry in laid.values()])
+
+
+def _lay(
+    volume: str, output: str, interior: F32, shape: Layout, kept: NDArray[np.int64], selection: Selection, whole: bool
+) -> tuple[Atlas, dict[str, Any]]:
+    """One output's atlas, and what the manifest says of it."""
+    if not np.isfinite(interior).all() or (output != "normal" and (interior < 0).any()):
+        bad = int(kept[np.argwhere(~np.isfinite(interior) | (interior < 0))[0][0]])
+        raise BakeError("bake.not_finite", f"the {output} map has a value that is not finite or is negative", f"{volume}: probe {bad}")
+    encoding, cost = ("float", 0.0) if output in _ALWAYS_FULL else choose_encoding(interior)
+    side = interior.shape[1]
+    atlas = Atlas(output, pack(interior, shape), side + 2, side, shape.columns, shape.rows, shape.layers, encoding)
+    entry: dict[str, Any] = {
+        "output": output,
+        "file": f"{volume}.{output}.exr",
+        "encoding": encoding,
+        "encoding_error": cost,
+        "channels": list(CHANNELS[output]),
+        "tile": atlas.tile,
+        "interior": atlas.interior,
+    }
+    if not whole and len(kept) and (interior == interior[0, 0, 0]).all():
+        stored = interior[0, 0, 0].astype(np.float16 if encoding == "half" else np.float32)
+        entry |= {"file": None, "constant": [float(str(x)) for x in stored]}
+    elif not whole and entry["channels"] == ["R", "G", "B"] and (interior == interior[..., :1]).all():
+        entry["channels"] = ["Y"] * 3
+    if output == "distance":
+        entry["miss"] = selection.miss_distance
+        atlas = replace(atlas, miss=selection.miss_distance)
+    return atlas, entry
 
 
 def _write(volume: VolumeData, described: list[dict[str, Any]], choice: Choice, trial: Trial | None, folder: Path) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from bake_core.scene import Scene
 from bake_core.spec import Spec
 from bake_core.tally import State
 from bake_core.tracer import Tracer
+from bake_core.walls import coarser
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -378,8 +379,14 @@ def _radiance(baked: Baked, random: np.random.Generator, active: I64, look: _Loo
 
 
 def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _Look) -> Figures:
-    """Of both moments, in units of the distance limit and its square, so that the two are numbers of one kind."""
-    side = next(v.atlases["visibility"].interior for v in baked.volumes if "visibility" in v.atlases)
+    """Of both moments, in units of the distance limit and its square, so that the two are numbers of one kind.
+
+    Where volumes' resolutions differ, of those that have the first one's.
+    """
+    sides = np.array([v.atlases["visibility"].interior if "visibility" in v.atlases else 0 for v in baked.volumes])
+    side = int(sides[sides > 0][0])
+    of, _ = _volume_of(baked.volumes, active)
+    active = active[sides[of] == side]
     # Each probe at most once while there are enough of them.
     probes = np.concatenate([random.permutation(active) for _ in range(-(-_FEWEST // len(active)))])[:_MOST]
     texels = random.integers(0, side**2, len(probes))
@@ -394,7 +401,10 @@ def _visibility(baked: Baked, random: np.random.Generator, active: I64, look: _L
     some = slice(0, estimates.shape[1])
     probes, texels, unit = probes[some], texels[some], np.stack([limits[some], limits[some] ** 2], -1)
     stored = _stored(baked.volumes, "visibility", probes, texels) / unit
-    intended = baked.state.visibility[probes, ..., :2].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
+    maps = baked.state.visibility[probes]
+    if side != maps.shape[1]:
+        maps = coarser(maps, side)
+    intended = maps[..., :2].reshape(len(probes), -1, 2)[np.arange(len(probes)), texels] / unit
     mean = float(np.sqrt((stored**2).sum(-1)).mean())
     return _figures(stored, intended, estimates / unit, np.zeros(len(probes)), mean, probes, paths)
 

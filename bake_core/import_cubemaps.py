@@ -29,7 +29,7 @@ from bake_core.images import read_exr
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.placement import Volume
 from bake_core.report import Run
-from bake_core.selection import Selection
+from bake_core.selection import Selection, visibility_sides
 from bake_core.spec import OUTPUTS, Spec, parse_spec
 from bake_core.tally import State
 from bake_core.walls import moments_and_walls
@@ -86,8 +86,9 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
     spec = _spec(description)
     volumes = tuple(_volume(v.name or f"v{i}", v) for i, v in enumerate(spec.volumes))
     r = spec.resolution
-    radiance = r.radiance or _RADIANCE
-    state = _empty_state(sum(v.probe_count for v in volumes), spec, radiance)
+    # Nothing to measure a lower resolution by: the highest, where it is left open.
+    radiance, visibility = r.radiance or _RADIANCE, visibility_sides(r)[0]
+    state = _empty_state(sum(v.probe_count for v in volumes), spec, radiance, visibility)
     longest = 0.0
     first = 0
     for volume in volumes:
@@ -109,8 +110,17 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
     miss = 2.0 ** math.ceil(math.log2(4 * max(longest, 1e-6)))
     state.distance[~np.isfinite(state.distance)] = miss
     offsets, untried = np.zeros((len(state.backface), 3), np.float32), [None] * len(volumes)
-    sides = {"irradiance": r.irradiance, "visibility": r.visibility, "distance": r.distance, "normal": r.normal}
-    selection = Selection(OUTPUTS, (False,) * len(volumes), (), capture=radiance, miss_distance=miss, **sides)
+    selection = Selection(
+        OUTPUTS,
+        (False,) * len(volumes),
+        (),
+        capture=radiance,
+        irradiance=r.irradiance,
+        visibility=visibility,
+        distance=r.distance,
+        normal=r.normal,
+        miss_distance=miss,
+    )
     source = _Source(f"sha256:{digest.hexdigest()}", 0, ())
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as work:
@@ -155,7 +165,7 @@ def _volume(name: str, volume: Any) -> Volume:
     return Volume(name, np.asarray(volume.origin, np.float64), np.asarray(volume.spacing, np.float64), volume.counts)
 
 
-def _empty_state(n: int, spec: Spec, radiance: int) -> State:
+def _empty_state(n: int, spec: Spec, radiance: int, visibility: int) -> State:
     r = spec.resolution
     return State(
         samples=HALVES,
@@ -164,7 +174,7 @@ def _empty_state(n: int, spec: Spec, radiance: int) -> State:
         needed=np.ones(n, np.bool_),
         irradiance=np.zeros((n, SCRAMBLES, r.irradiance**2, 3), np.float32),
         radiance=np.zeros((n, HALVES, radiance**2, 3), np.float32),
-        visibility=np.zeros((n, r.visibility, r.visibility, 3), np.float32),
+        visibility=np.zeros((n, visibility, visibility, 3), np.float32),
         backface=np.zeros(n, np.float32),
         distance=np.zeros((n, r.distance**2), np.float32),
         normal=np.zeros((n, r.normal**2, 3), np.float32),
@@ -206,4 +216,4 @@ def _fill(state: State, at: int, volume: Volume, spec: Spec, radiance: int, ligh
     state.distance[at] = distance[0]
     state.normal[at] = normal[0] if r.normal == r.distance else octahedral_surfaces(distances[None], r.normal)[1][0]
     limit, unit = np.array([volume.distance_limit]), np.array([volume.spacing.min()])
-    state.visibility[at] = moments_and_walls(distance, limit, unit, r.visibility)[0]
+    state.visibility[at] = moments_and_walls(distance, limit, unit, state.visibility.shape[1])[0]

@@ -14,12 +14,14 @@ from bake_core.occlusion import nothing_occludes
 from bake_core.placement import Volume
 from bake_core.reach import reach_box, triangles_meeting
 from bake_core.scene import NO_TEXTURE, Scene
-from bake_core.spec import OUTPUTS, OutputName, Spec
+from bake_core.spec import OUTPUTS, SMALLEST_RESOLUTION, OutputName, Resolution, Spec
 
 F64 = NDArray[np.float64]
 
 # The capture map's side where radiance itself is looked at by nobody but the irradiance filter, and where glossy receivers look at it.
 _CAPTURE_DIFFUSE, _CAPTURE_GLOSSY = 16, 64
+# Tried where the spec leaves visibility's resolution open.
+_VISIBILITY_SIDES = (32, 16, 8)
 # Of a texel as it is usually stored: halves of three colours, floats of two moments and half a float of the walls, one float, halves of a
 # vector.
 _TEXEL_BYTES: dict[OutputName, int] = {"irradiance": 6, "visibility": 10, "radiance": 6, "distance": 4, "normal": 6}
@@ -60,6 +62,8 @@ class Selection:
         Texels along the radiance (capture) map's side, stored or not.
     irradiance, visibility, distance, normal : int
         Texels along each map's side.
+    coarser : tuple of int
+        Along the sides that visibility maps may end up with instead, in falling order: none where the spec says how many.
     miss_distance : float
         What the distance map holds where a ray meets nothing: finite, and longer than any hit can be.
     """
@@ -73,6 +77,7 @@ class Selection:
     distance: int
     normal: int
     miss_distance: float
+    coarser: tuple[int, ...] = ()
 
     def keeps(self, output: OutputName) -> bool:
         return output in self.outputs
@@ -113,18 +118,27 @@ def select(scene: Scene, spec: Spec, volumes: Sequence[Volume], probes: Sequence
     # A power of two above four diagonals, so that the value says of itself that it is no measurement.
     miss = 2.0 ** math.ceil(math.log2(4 * max(float(np.linalg.norm(size)), 1e-6)))
     r = spec.resolution
+    sides = visibility_sides(r)
     chosen = Selection(
         outputs=kept,
         seen=seen,
         left_out=(),
         capture=r.radiance or (_CAPTURE_GLOSSY if reflects else _CAPTURE_DIFFUSE),
         irradiance=r.irradiance,
-        visibility=r.visibility,
+        visibility=sides[0],
         distance=r.distance,
         normal=r.normal,
         miss_distance=miss,
+        coarser=sides[1:],
     )
     return replace(chosen, left_out=tuple(_left_out(chosen, volumes, auto, glossy)))
+
+
+def visibility_sides(resolution: Resolution) -> tuple[int, ...]:
+    """What visibility maps may have along their sides, in falling order: one, or where it is left open all that the distance map bears."""
+    if resolution.visibility is not None:
+        return (resolution.visibility,)
+    return tuple(side for side in _VISIBILITY_SIDES if side <= resolution.distance) or (SMALLEST_RESOLUTION,)
 
 
 def _holds(scene: Scene, volume: Volume, materials: NDArray[np.bool_]) -> bool:

@@ -145,7 +145,7 @@ class Resolution(_Model):
     """Interior texels along a tile's side, per output. Even, so that the octahedron's folds lie on texel corners."""
 
     irradiance: Resolution_ = 8
-    visibility: Resolution_ = 16
+    visibility: Resolution_ | None = 16
     radiance: Resolution_ | None = None
     distance: Resolution_ = 64
     normal: Resolution_ = 64

@@ -29,6 +29,10 @@ NEAREST = 1 / 1024
 # Of conjugate gradients. Of products of tents the fit's matrix has condition 9 at most, so each halves the error: to 2⁻¹⁶, which is less
 # than what half floats lose.
 _STEPS = 16
+# Along the side of a map of directions, to fit a coarser map by.
+_RAYS = 64
+# Probes at once: bounds memory to some 100 MB.
+_AT_ONCE = 256
 
 
 @cache
@@ -127,13 +131,50 @@ def walls(distance: F64, limit: F64, unit: F64, resolution: int) -> NDArray[np.f
     (p, resolution, resolution, 1) float32
         unit / (d·|ω|₁), from 0 to 1 / :data:`NEAREST`.
     """
-    rays = distance.shape[1]
-    side = round(rays**0.5)
-    texels, weights, nearest = _look_ups(resolution, side)
-    norm = np.abs(texel_directions(side)).sum(-1).reshape(-1)
+    norm = np.abs(texel_directions(round(distance.shape[1] ** 0.5))).sum(-1).reshape(-1)
     reach = np.minimum(distance, limit[:, None]) / unit[:, None] * norm
-    values = 1 / np.maximum(reach, NEAREST)
-    out = np.empty((len(distance), resolution**2))
+    return _fitted(1 / np.maximum(reach, NEAREST), resolution)
+
+
+def coarser(maps: NDArray[np.float32], resolution: int) -> NDArray[np.float32]:
+    """What :func:`moments_and_walls` would have made of the same probes at a lower resolution, from maps of a higher one.
+
+    Moments are looked up at the new texels' centres; walls are fitted to look-ups in as many directions as a distance map has by default.
+
+    Parameters
+    ----------
+    maps : (p, side, side, 3) float32
+    resolution : int
+        Less than `side`.
+
+    Returns
+    -------
+    (p, resolution, resolution, 3) float32
+    """
+    side = maps.shape[1]
+    out = np.empty((len(maps), resolution, resolution, 3), np.float32)
+    for first in range(0, len(maps), _AT_ONCE):
+        flat = maps[first : first + _AT_ONCE].reshape(-1, side**2, 3).astype(np.float64)
+        some = out[first : first + _AT_ONCE]
+        some[..., :2] = _looked_up(flat[..., :2], side, resolution).reshape(-1, resolution, resolution, 2)
+        some[..., 2:] = _fitted(_looked_up(flat[..., 2:], side, _RAYS)[..., 0], resolution)
+    return out
+
+
+def _looked_up(values: F64, side: int, rays: int) -> F64:
+    """Bilinear look-ups in maps (p, side², c) through the centres of a map of rays², (p, rays², c)."""
+    texels, weights, _ = _look_ups(side, rays)
+    out = weights[:, 0, None] * values[:, texels[:, 0]]
+    for k in range(1, 4):
+        out += weights[:, k, None] * values[:, texels[:, k]]
+    return out
+
+
+def _fitted(values: F64, resolution: int) -> NDArray[np.float32]:
+    """Maps (p, resolution, resolution, 1) whose look-ups come nearest to values (p, d²) in the directions of a d×d map."""
+    rays = values.shape[1]
+    texels, weights, nearest = _look_ups(resolution, round(rays**0.5))
+    out = np.empty((len(values), resolution**2))
     room = np.empty(resolution**2), np.empty(resolution**2), np.empty(rays)
-    _fit_kernel(texels, weights, np.ascontiguousarray(values[:, nearest]), values, _STEPS, *room, out)
+    _fit_kernel(texels, weights, np.ascontiguousarray(values[:, nearest]), np.ascontiguousarray(values), _STEPS, *room, out)
     return np.clip(out, 0, 1 / NEAREST).astype(np.float32).reshape(-1, resolution, resolution, 1)

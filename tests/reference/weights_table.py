@@ -1,10 +1,10 @@
 """The tables of docs/leaks.md: `python -m tests.reference.weights_table [SCENE...]`, and with `--leaks` what gets through a wall of 2 cm.
 
 A scene is an example's name, or that of a file in `../shared/scenes` that has its spec in `../shared/specs`. Each is baked with the same
-samples as ours is stored by default, again with its probes on their lattice, and so with RTXGI's resolutions, of which moments are kept in
-full floats here, where RTXGI rounds them. All are asked for irradiance at the receivers of `octobake verify`, RTXGI's with each of 5 × 5
-biases; and at as many points in the open, about random directions. `--page docs/leaks.md` puts the rows of the scenes named into the page,
-and leaves the others'.
+samples as ours is stored by default, again with its probes on their lattice, with its visibility's resolution left open, and with RTXGI's
+resolutions, of which moments are kept in full floats here, where RTXGI rounds them. All are asked for irradiance at the receivers of
+`octobake verify`, RTXGI's with each of 5 × 5 biases; and at as many points in the open, about random directions. `--page docs/leaks.md`
+puts the rows of the scenes named into the page, and leaves the others'.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ def compare(name: str, samples: int, paths: int) -> str:
         scene_path, document = files_of(name, folder)
         mine = bake_at(scene_path, document, {}, samples, folder)
         still = bake_at(scene_path, document, {"probes": "lattice"}, samples, folder)
+        spare = bake_at(scene_path, document, {"resolution": {"visibility": None}}, samples, folder)
         theirs = bake_at(scene_path, document, RTXGI, samples, folder)
         scene = load_scene(scene_path)
         tracer = prepare(scene, parse_spec(document)).tracer
@@ -115,6 +116,7 @@ def compare(name: str, samples: int, paths: int) -> str:
         f"DDGI, best of 25: {best[0]:g}, {best[1]:g}": row(ddgi(theirs, best), RTXGI_BYTES),
         "octobake": row(ours(mine), held(mine)),
         "octobake, probes on their lattice": row(ours(still), held(still)),
+        f"octobake, walls of {spare[0].atlases['walls'].interior}²": row(ours(spare), held(spare)),
     }
     others = [figures(ours(with_parameters(mine, bias, fade))).relmse or 0 for bias in (0.1, 0.15, 0.2) for fade in (0.01, 0.02, 0.05)]
     least = swept[best].relmse or 0

@@ -28,7 +28,7 @@ def volume_of(folder: Path, example: Example) -> VolumeData:
 
 def choice_for(folder: Path, example: Example, volume: VolumeData, threads: int = THREADS) -> Choice:
     scene = load_scene(folder / "scene.glb")
-    return choose_parameters(scene, prepare(scene, parse_spec(example[1])).whole, [volume], threads=threads)[0]
+    return choose_parameters(scene, prepare(scene, parse_spec(example[1])).whole, [[volume]], threads=threads)[0]
 
 
 def test_walls_between_rooms_keep_the_default_and_their_darkness(tmp_path: Path) -> None:
@@ -64,3 +64,27 @@ def test_without_walls_or_light_nothing_is_measured(outputs: list[str], tmp_path
     volume = bake_example(tmp_path, closed_box(0.5, 1.0), stop=STOP, outputs=outputs).volumes[0]
     assert volume.parameters == PARAMETERS
     assert json.loads((tmp_path / "bundle" / MANIFEST).read_bytes())["volumes"][0]["chosen"] is None
+
+
+def test_visibility_is_as_coarse_as_costs_nothing(tmp_path: Path) -> None:
+    """Left open, its resolution is chosen for each volume: of what it is measured to need, and no light comes through by it."""
+    document = {**two_rooms()[1], "resolution": {"visibility": None}}
+    bundle = bake_example(tmp_path, (two_rooms()[0], document), stop=STOP)
+    (volume,) = bundle.volumes
+    side = volume.atlases["walls"].interior
+    assert side == 8 and volume.atlases["visibility"].interior == side
+    assert leak_ratio(lambda p, n: sample([volume], p, n).irradiance) < 0.002
+    report = json.loads((tmp_path / "bundle" / "report.json").read_bytes())
+    assert report["audit"]["texels"]["visibility"]["error"] < 0.05
+
+
+def test_a_lower_resolution_is_taken_only_where_it_is_no_worse(tmp_path: Path) -> None:
+    """The same maps once more, and maps of a wall everywhere: the one is as good, the other is not."""
+    example = two_rooms()
+    volume = volume_of(tmp_path, example)
+    walls = volume.atlases["walls"]
+    near = replace(volume, atlases={**volume.atlases, "walls": replace(walls, texels=np.full_like(walls.texels, 8.0))})
+    scene = load_scene(tmp_path / "scene.glb")
+    tracer = prepare(scene, parse_spec(example[1])).whole
+    for ways, expected in (([volume], 0), ([volume, near], 0), ([volume, near, volume], 2)):
+        assert choose_parameters(scene, tracer, [ways], threads=THREADS)[0].resolution == expected

@@ -148,7 +148,7 @@ def test_whole_numbers_may_stand_where_real_ones_do_and_the_other_way_round_not(
         ("resolution/irradiance", 7, "invalid", "resolution.irradiance"),
         ("resolution/irradiance", 0, "invalid", "resolution.irradiance"),
         ("resolution/distance", 1026, "invalid", "resolution.distance"),
-        ("resolution/visibility", None, "invalid", "resolution.visibility"),
+        ("resolution/normal", None, "invalid", "resolution.normal"),
         ("max_bounces", -1, "invalid", "max_bounces"),
         ("max_bounces", 1 << 21, "invalid", "max_bounces"),
         ("stop/target_error", 0, "invalid", "stop.target_error"),
