@@ -32,7 +32,7 @@ F64 = NDArray[np.float64]
 
 # Of a spacing: no probe moves farther along an axis.
 FARTHEST = 0.45
-# How far to the sides the rays beside an axis go for each step along it, and by which part of its distance a wall may be off a plane there.
+# How far to the sides the rays beside an axis go for each step along it, and by which part of its distance a wall may be farther off there.
 _BESIDE, _FLAT = 0.25, 0.25
 
 
@@ -52,10 +52,10 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
 
     Notes
     -----
-    A wall is what a ray along an axis meets within a spacing, from the front or from either side where it is double-sided, and rays beside
-    it in about the same plane: one of two across, and one of two the other way across, for probes stand near corners, too. Columns and
-    leaves are none and draw nobody, but a probe between one and a wall stands in the middle. What is met from behind says that the probe
-    stands inside a solid, and draws it nowhere.
+    A wall is what a ray along an axis meets within a spacing, from the front or from either side where it is double-sided, and does not
+    let pass rays beside it: one of two across is stopped in about the same plane or before, and one of two the other way across. So an
+    edge of a box is a wall. Columns and leaves are none and draw nobody, but a probe between one and a wall stands in the middle. What is
+    met from behind says that the probe stands inside a solid, and draws it nowhere.
     """
     spacing = np.concatenate([np.broadcast_to(v.spacing, (v.probe_count, 3)) for v in volumes])
     met = np.empty((len(positions), 3, 2, 5))
@@ -64,8 +64,8 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
     anything = np.isfinite(straight)
     # In the first place, so that no inf is taken from another.
     ahead = np.where(anything, straight, 0)
-    flat = np.abs(met[..., 1:] - ahead[..., None]) <= _FLAT * ahead[..., None]
-    wall = anything & flat.reshape(*flat.shape[:-1], 2, 2).any(-1).all(-1)
+    stopped = met[..., 1:] <= (1 + _FLAT) * ahead[..., None]
+    wall = anything & stopped.reshape(*stopped.shape[:-1], 2, 2).any(-1).all(-1)
     offsets = np.zeros_like(positions)
     for side, sign in ((0, -1), (1, 1)):
         d = np.where(wall[..., side] & ~anything[..., 1 - side], ahead[..., side], 0)
