@@ -17,6 +17,13 @@ _CONFIGURATION: dict[str, Any] = {
     "distributed.worker.http.routes": [],
     # Its sampling profiler walks the stacks of our kernels' threads for pages that nobody serves.
     "distributed.worker.profile.enabled": False,
+    # What it remembers for pages and post-mortems: messages, transitions, graphs and errors of the last thousand tasks, measurements of an
+    # hour. Filling that up takes a service half an hour, and looks like a leak; nobody reads it.
+    "distributed.admin.low-level-log-length": 50,
+    "distributed.admin.log-length": 200,
+    "distributed.admin.system-monitor.log-length": 10,
+    "distributed.diagnostics.computations.max-history": 1,
+    "distributed.diagnostics.erred-tasks.max-history": 1,
     "distributed.comm.timeouts.connect": "10s",
 }
 
@@ -30,8 +37,14 @@ def kept(extensions: Mapping[str, type]) -> dict[str, type]:
     return {name: extension for name, extension in extensions.items() if name != "spans"}
 
 
+def _is_news(record: logging.LogRecord) -> bool:
+    """Not what a task raised: that comes back with its future, and is told to whoever owns the job, or logged there."""
+    return not record.getMessage().startswith("Compute Failed")
+
+
 def configure() -> None:
     """Set Dask up in this process, before anything of it starts."""
     dask.config.set(_CONFIGURATION)
     # It reads its own logging settings when it is imported, which is over. Lost workers, the news it warns of, are ours to tell.
     logging.getLogger("distributed").setLevel(logging.ERROR)
+    logging.getLogger("distributed.worker").addFilter(_is_news)
