@@ -8,7 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests import glsl
+from tests import chromium, glsl
 
 
 @pytest.fixture(scope="session")
@@ -23,12 +23,12 @@ def shared() -> Path:
 @pytest.fixture(params=["lavapipe", "swiftshader", "webgl2"])
 def host(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> glsl.Host:
     """What runs GLSL, each in turn: Mesa's Vulkan driver, Chromium's, and Chromium's WebGL2."""
-    if request.param != "lavapipe" and not glsl.SWIFTSHADER.is_file():
-        pytest.skip(f"{request.param} comes with Chromium, which is not in build/chromium; `make chromium` fetches it")
+    if request.param != "lavapipe":
+        chromium.needed(request.param)
     if request.param == "webgl2":
         return glsl.on_webgl2
     if request.param == "swiftshader":
-        monkeypatch.setenv("VK_DRIVER_FILES", str(glsl.SWIFTSHADER))
+        monkeypatch.setenv("VK_DRIVER_FILES", str(chromium.SWIFTSHADER))
     return glsl.on_vulkan
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from shutil import copy
@@ -22,15 +21,13 @@ from bake_core.item_shader import answer_items, packed
 from bake_core.probe_textures import probe_layers, probe_module
 from bake_core.shader_compiler import shader_text
 from bake_core.vulkan import Device
+from tests.chromium import document
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 # GLSL, vectors (n, 3) for each item, how many vec4 it answers with, volumes to bind; (n, rows, 4) float32.
 Host = Callable[[str, Sequence[F64], int, Sequence[VolumeData]], F32]
 
-# Where `make chromium` puts it.
-CHROMIUM = Path(__file__).resolve().parents[1] / "build" / "chromium"
-SWIFTSHADER = CHROMIUM / "usr" / "lib" / "chromium" / "vk_swiftshader_icd.json"
 # Items along a row of the browser's texture: every WebGL2 takes so many.
 WIDTH = 2048
 
@@ -86,22 +83,12 @@ def on_webgl2(answer: str, inputs: Sequence[F64], rows: int, volumes: Sequence[V
 
 def _browse(job: dict[str, object]) -> str:
     """Open webgl2.html with a job in Chromium, and return what it leaves in the page."""
-    libraries = CHROMIUM / "usr" / "lib" / "x86_64-linux-gnu"
     with TemporaryDirectory() as place:
         page = Path(copy(Path(__file__).with_name("webgl2.html"), place))
         # Not in the page: Chromium takes a minute over one of 20 MB.
         page.with_name("job.js").write_text(f"const job = {json.dumps(job)};", "utf-8")
-        # The page is our own, and a sandbox needs what containers lack. It draws on the CPU, like every other host of ours.
-        flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", f"--user-data-dir={place}/profile"]
-        done = subprocess.run(
-            [CHROMIUM / "usr/lib/chromium/chromium-headless-shell", *flags, "--dump-dom", page.as_uri()],
-            env={"LD_LIBRARY_PATH": f"{libraries}:{libraries}/pulseaudio", "HOME": place, "TMPDIR": place},
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-    found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
-    assert found, f"Chromium left no page: {done.stderr[-2000:]}"
+        left = document(page.as_uri(), "--enable-unsafe-swiftshader")
+    found = re.search(r"<pre>(.*?)</pre>", left, re.DOTALL)
+    assert found, left
     assert not found[1].startswith("error"), found[1]
     return found[1]

@@ -12,6 +12,7 @@ from bake_core import irradiance, light_field
 from bake_core.bundle import VolumeData
 from bake_core.parameters import PARAMETERS
 from tests import glsl
+from tests.chromium import SWIFTSHADER
 from tests.conformance import rooms, synthetic
 
 F64 = NDArray[np.float64]
@@ -65,7 +66,7 @@ def main() -> None:
     sharp = [replace(v, parameters=dict(PARAMETERS)) for v in soft]
     print("| host | octahedral map | irradiance, soft shadows | as a bake's | other verdicts | distance |")
     print("|---|---|---|---|---|---|")
-    hosts = (("lavapipe", glsl.on_vulkan, None), ("SwiftShader", glsl.on_vulkan, glsl.SWIFTSHADER), ("WebGL2", glsl.on_webgl2, None))
+    hosts = (("lavapipe", glsl.on_vulkan, None), ("SwiftShader", glsl.on_vulkan, SWIFTSHADER), ("WebGL2", glsl.on_webgl2, None))
     for name, host, driver in hosts:
         os.environ.pop("VK_DRIVER_FILES", None)
         if driver:

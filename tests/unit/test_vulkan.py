@@ -13,7 +13,7 @@ import pytest
 from bake_core.errors import MachineError
 from bake_core.shader_compiler import compile_glsl
 from bake_core.vulkan import Bindings, Device, Draw, color_target, compute_pipeline, depth_target, graphics_pipeline, storage, texture
-from tests.glsl import SWIFTSHADER
+from tests.chromium import SWIFTSHADER
 
 DOUBLE = """#version 450
 layout(local_size_x = 64) in;
