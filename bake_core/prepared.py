@@ -68,13 +68,17 @@ class Prepared:
         return self.selection.left_out + unneeded(self.tracer.tables, sealed=self.tracer is not self.whole)
 
 
-def prepare(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 1) -> Prepared:
+def prepare(
+    scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 1, trials: tuple[Trial | None, ...] | None = None
+) -> Prepared:
     """Place the probes, choose the outputs, build the acceleration structure.
 
     Parameters
     ----------
     threads : int
         The result is the same for any number.
+    trials : tuple of Trial or None, optional
+        What preparing the same came to elsewhere: nothing is measured again.
     find : callable, optional
         Where an image that the spec names lies; in what is prepared it is named by its digest.
 
@@ -87,7 +91,7 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 
     spec = spec.model_copy(update={"environment": named})
     positions = np.concatenate([v.positions() for v in volumes]) - scene.origin
     whole = Tracer.build(scene, spec, environment)
-    offsets, trials = _relocated(scene, spec, whole, volumes, positions, threads)
+    offsets, trials = _relocated(scene, spec, whole, volumes, positions, threads, trials)
     positions = positions + offsets
     edges = np.cumsum([v.probe_count for v in volumes])[:-1]
     stand = [
@@ -113,11 +117,17 @@ def prepare(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 
 
 
 def _relocated(
-    scene: Scene, spec: Spec, tracer: Tracer, volumes: Sequence[Volume], positions: NDArray[np.float64], threads: int
+    scene: Scene,
+    spec: Spec,
+    tracer: Tracer,
+    volumes: Sequence[Volume],
+    positions: NDArray[np.float64],
+    threads: int,
+    known: tuple[Trial | None, ...] | None,
 ) -> tuple[NDArray[np.float32], tuple[Trial | None, ...]]:
     """Offsets of all volumes' probes in turn, and what was measured to decide on them."""
     offsets = np.zeros(positions.shape, np.float32)
-    trials: list[Trial | None] = [None] * len(volumes)
+    trials: list[Trial | None] = list(known or [None] * len(volumes))
     may = [spec.relocates(v.probe_count) for v in volumes]
     if any(may):
         found = relocate(tracer, volumes, positions)
@@ -125,7 +135,7 @@ def _relocated(
         for i, volume in enumerate(volumes):
             own = slice(first, first + volume.probe_count)
             first = own.stop
-            if may[i] and spec.probes == "auto" and found[own].any():
+            if known is None and may[i] and spec.probes == "auto" and found[own].any():
                 trials[i] = try_relocation(scene, tracer, volume, found[own].astype(np.float64), 1 / len(volumes), threads=threads)
             trial = trials[i]
             if may[i] and (trial is None or trial.moved):

@@ -159,7 +159,8 @@ class Driver:
         clock = Clock(spec, self._show)
 
         clock.stage("building")
-        probes, threads, plan = self._one(worker.prepare, work)
+        probes, threads, plan, trials = self._one(worker.prepare, work)
+        work = replace(work, trials=trials)
         self._store.set_plan(self.job.id, plan)
         self._move(State.RUNNING)
         clock.stage("compiling")

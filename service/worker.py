@@ -33,6 +33,7 @@ from bake_core.prepared import Prepared
 from bake_core.prepared import prepare as prepare_bake
 from bake_core.preview import preview
 from bake_core.progress import Progress
+from bake_core.relocation_trial import Trial
 from bake_core.report import Run
 from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
@@ -68,6 +69,8 @@ class Work:
     cached_scenes : int
     memory_bytes : int or None
         Resident memory that the process may come to while it works on this.
+    trials : tuple of Trial or None, or None
+        What :func:`prepare` measured of the bake's volumes: a worker that takes over does not measure again.
     """
 
     job: str
@@ -77,6 +80,7 @@ class Work:
     threads: int
     cached_scenes: int
     memory_bytes: int | None = None
+    trials: tuple[Trial | None, ...] | None = None
 
     @property
     def own_threads(self) -> int:
@@ -84,8 +88,13 @@ class Work:
         return self.threads or len(os.sched_getaffinity(0))
 
 
-def prepare(work: Work) -> tuple[int, int, dict[str, Any]]:
-    """Read, check and build the scene; answers how many probes there are, how many threads this worker bakes with, and the plan.
+def prepare(work: Work) -> tuple[int, int, dict[str, Any], tuple[Trial | None, ...]]:
+    """Read, check and build the scene.
+
+    Returns
+    -------
+    int, int, dict, tuple
+        How many probes there are, how many threads this worker bakes with, the plan, and what was measured of the volumes.
 
     Raises
     ------
@@ -99,7 +108,7 @@ def prepare(work: Work) -> tuple[int, int, dict[str, Any]]:
         told = asdict(held) | {"left_out": [x.entry() for x in held.left_out]}
         if work.memory_bytes is not None and told["memory_bytes"] > work.memory_bytes:
             raise _over_memory(work, f"{told['memory_bytes']} bytes are predicted")
-        return prepared.probe_count, work.own_threads, told
+        return prepared.probe_count, work.own_threads, told, prepared.trials
 
 
 def compile_kernels(work: Work) -> None:
@@ -323,7 +332,7 @@ def _prepared(work: Work) -> Prepared:
             # A job with a limit is not charged for the scenes of others.
             while len(_cache) >= (work.cached_scenes if work.memory_bytes is None else 1):
                 _cache.popitem(last=False)
-            _cache[key] = prepare_bake(scene, parse_spec(work.spec), find_stored(stored), threads=work.own_threads)
+            _cache[key] = prepare_bake(scene, parse_spec(work.spec), find_stored(stored), threads=work.own_threads, trials=work.trials)
         _cache.move_to_end(key)
         return _cache[key]
 

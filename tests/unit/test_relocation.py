@@ -12,6 +12,7 @@ from bake_core.examples import box_sides, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.prepared import prepare
 from bake_core.relocation import FARTHEST
+from bake_core.relocation_trial import Trial
 from bake_core.spec import parse_spec
 from tests.baking import bake_example
 from tests.scenes import add_square, load
@@ -118,7 +119,16 @@ def test_probes_stay_on_a_lattice_that_is_measured_to_be_better(tmp_path: Path) 
 def test_what_is_measured_does_not_depend_on_threads() -> None:
     glb, document = two_rooms()
     scene, spec = load_example(glb), parse_spec(document)
-    assert prepare(scene, spec, threads=1).trials == prepare(scene, spec, threads=2).trials
+    one, two = (prepare(scene, spec, threads=n) for n in (1, 2))
+    assert one.trials == two.trials != (None,)
+
+
+def test_what_was_measured_elsewhere_is_taken_as_it_is() -> None:
+    glb, document = two_rooms()
+    scene, spec = load_example(glb), parse_spec(document)
+    for moved in (False, True):
+        told = prepare(scene, spec, trials=(Trial(7, 0.1, 0.2, moved),))
+        assert told.trials == (Trial(7, 0.1, 0.2, moved),) and told.offsets.any() == moved
 
 
 def test_where_no_light_is_nothing_is_measured() -> None:
