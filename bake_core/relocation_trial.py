@@ -8,7 +8,7 @@ the query would, with rays in the place of maps that do not exist yet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ _POINTS, _LEAST, _SCRAMBLES, _PATHS = 1024, 128, 4, 8
 # Fewer tell nothing.
 _FEWEST = 64
 _SEED = 0x6E1A7E
+# Light that has bounced oftener is too even to tell places apart; and whether it ends at all has not been looked at yet.
+_BOUNCES = 16
 # Of the lattice's error: in the open probes near walls are a little worse, so on surfaces they must be better by this much.
 _WORTH = 0.05
 
@@ -80,6 +82,8 @@ def try_relocation(scene: Scene, tracer: Tracer, volume: Volume, offsets: F64, s
     n = len(stands)
     if n < _FEWEST:
         return None
+    bounces = min(tracer.tables.max_bounces, np.int64(_BOUNCES))
+    tracer = replace(tracer, tables=tracer.tables._replace(max_bounces=bounces))
     truth = irradiance_at(tracer, stands, samples=_PATHS, scrambles=_SCRAMBLES, seed=_SEED, threads=threads)
     ways = [_answers(tracer, volume, stands, scene.origin, moved, threads) for moved in (np.zeros_like(offsets), offsets)]
     if not (truth.any() and all(np.isfinite(values).all() for values in (truth, *ways))):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bake_core.examples import box_sides, cornell, quads_part, two_rooms
+from bake_core.examples import box_sides, closed_box, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.prepared import prepare
 from bake_core.relocation import FARTHEST
@@ -138,3 +138,10 @@ def test_where_no_light_is_nothing_is_measured() -> None:
     spec = parse_spec({"version": 1, "volumes": [{"origin": [-0.5] * 3, "spacing": [1.0] * 3, "counts": [2] * 3}]})
     prepared = prepare(load(w), spec)
     assert prepared.trials == (None,) and prepared.offsets.all()
+
+
+def test_light_that_never_ends_ends_here() -> None:
+    """A white room with a lamp is refused once it has been prepared; preparing it takes no longer than another."""
+    glb, document = closed_box(1.0, 1.0)
+    prepared = prepare(load_example(glb), parse_spec(document))
+    assert prepared.spec.max_bounces is None and prepared.trials[0] is not None
