@@ -20,7 +20,7 @@ from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.irradiance import sample
 from bake_core.receiver_irradiance import irradiance_at
 from bake_core.receivers import draw_receivers, stands_of
-from bake_core.relmse import relative_squares
+from bake_core.relmse import RELMSE_FLOOR, relative_squares
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
 
@@ -102,8 +102,8 @@ def choose_parameters(scene: Scene, tracer: Tracer, volumes: Sequence[Sequence[V
     Surely: by 1 %, and by three standard errors of the difference, for the best of twenty is partly luck. The error is the mean of bounded
     relative squares, free of the reference's noise. And at dark points the mean must not rise: a leak is worse than its square.
 
-    Then its visibility maps' resolution: the lowest with a mean square at most 5 % above that of the highest, and at dark points no more
-    light than with it but for a thousandth of the mean.
+    Then its visibility maps' resolution: the lowest with a mean square at most 5 % above that of the highest, at dark points no more
+    light than with it but for a thousandth of the mean, and nowhere an answer that is off the highest's by as much as that is.
 
     Parameters
     ----------
@@ -167,11 +167,16 @@ def _choose(scene: Scene, tracer: Tracer, ways: Sequence[VolumeData], points: in
     if change.mean() + _SURE * change.std() / np.sqrt(len(change)) >= -_WORTH * before.mean():
         best = _Tried(PARAMETERS, before)
     error, resolution = float(best.squares.mean()), 0
-    enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(ask(best.parameters)) + _LET_IN * float(size.mean())
+    highest = ask(best.parameters)
+    enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(highest) + _LET_IN * float(size.mean())
+    # Of answers, not of estimates, so there is no noise in it: one nook that is lit from next door is no small part of a mean.
+    own = np.linalg.norm(highest, axis=-1)
+    bound = np.hypot(own, RELMSE_FLOOR * own.mean())
     for fewer in range(1, len(ways)):
         answers = ask(best.parameters, fewer)
         found = float(relative_squares(answers, estimates, bounded=True).mean())
-        if found <= enough and light_in_the_dark(answers) <= darkest:
+        near = (np.linalg.norm(answers - highest, axis=-1) < bound).all()
+        if near and found <= enough and light_in_the_dark(answers) <= darkest:
             error, resolution = found, fewer
     return Choice(best.parameters, n, resolution, error, float(before.mean()))
 
