@@ -50,6 +50,8 @@ LARGEST = {**PARAMETERS, "normal_bias": max(BIASES)}
 # Points, shared out between volumes, and paths from each for each of four estimates: few points would miss small rooms.
 _POINTS, _SCRAMBLES, _PATHS = 2048, 4, 16
 _SEED = 0x9A7A3E
+# Points at which resolutions are compared with each other, where nothing is traced; and by how much they may differ in the mean of squares.
+_MANY, _OFF = 32768, 0.01
 # Of a volume among many; and how many must be found at least, for fewer tell nothing.
 _LEAST, _FEWEST = 256, 64
 # Dark is what receives less than this part of the volume's mean.
@@ -103,7 +105,7 @@ def choose_parameters(scene: Scene, tracer: Tracer, volumes: Sequence[Sequence[V
     relative squares, free of the reference's noise. And at dark points the mean must not rise: a leak is worse than its square.
 
     Then its visibility maps' resolution: the lowest with a mean square at most 5 % above that of the highest, at dark points no more
-    light than with it but for a thousandth of the mean, and nowhere an answer that is off the highest's by as much as that is.
+    light than with it but for a thousandth of the mean, and answers that are the highest's to a hundredth in the mean of squares.
 
     Parameters
     ----------
@@ -167,18 +169,30 @@ def _choose(scene: Scene, tracer: Tracer, ways: Sequence[VolumeData], points: in
     if change.mean() + _SURE * change.std() / np.sqrt(len(change)) >= -_WORTH * before.mean():
         best = _Tried(PARAMETERS, before)
     error, resolution = float(best.squares.mean()), 0
-    highest = ask(best.parameters)
-    enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(highest) + _LET_IN * float(size.mean())
-    # Of answers, not of estimates, so there is no noise in it: one nook that is lit from next door is no small part of a mean.
-    own = np.linalg.norm(highest, axis=-1)
-    bound = np.hypot(own, RELMSE_FLOOR * own.mean())
-    for fewer in range(1, len(ways)):
+    enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(ask(best.parameters)) + _LET_IN * float(size.mean())
+    for fewer in _as_the_highest(scene, tracer, ways, best.parameters):
         answers = ask(best.parameters, fewer)
         found = float(relative_squares(answers, estimates, bounded=True).mean())
-        near = (np.linalg.norm(answers - highest, axis=-1) < bound).all()
-        if near and found <= enough and light_in_the_dark(answers) <= darkest:
+        if found <= enough and light_in_the_dark(answers) <= darkest:
             error, resolution = found, fewer
     return Choice(best.parameters, n, resolution, error, float(before.mean()))
+
+
+def _as_the_highest(scene: Scene, tracer: Tracer, ways: Sequence[VolumeData], parameters: dict[str, float]) -> list[int]:
+    """Which of the lower resolutions answer as the highest does, to a hundredth in the mean of squares (|·|² over that answer's).
+
+    Not bounded: one nook that is lit from next door is a small part of any other mean. And nothing is traced, so many points are asked.
+    """
+    if len(ways) == 1:
+        return []
+    receivers = draw_receivers(scene, tracer, ways[:1], _MANY, _SEED)
+    highest, *others = (sample([replace(way, parameters=parameters)], receivers.positions, receivers.normals).irradiance for way in ways)
+    size = (highest**2).sum(-1)
+    if not size.any():
+        return []
+    scale = size + (RELMSE_FLOOR * np.sqrt(size).mean()) ** 2
+    apart = [float((((answers - highest) ** 2).sum(-1) / scale).mean()) for answers in others]
+    return [i for i, off in enumerate(apart, 1) if off <= _OFF]
 
 
 class _Tried(NamedTuple):
