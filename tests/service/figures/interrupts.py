@@ -54,18 +54,14 @@ def _cancel(server: Server, client: Client, pavilion: Path, number: int, chance:
 
 def _kill(server: Server, client: Client, job: Bake, kills: int, chance: random.Random) -> list[float]:
     took: list[float] = []
-    events = client.events(job)
+    next(e for e in client.events(job) if e.type == "progress" and e.document["stage"] == "tracing")
     while len(took) < kills:
-        next(e for e in events if e.type == "progress" and e.document["stage"] == "tracing")
-        deadline = time.monotonic() + chance.uniform(*BETWEEN_KILLS)
-        # Read on meanwhile, so that nothing old is left to be read after the kill.
-        while time.monotonic() < deadline:
-            next(events)
+        time.sleep(chance.uniform(*BETWEEN_KILLS))
         server.bake_worker().kill()
         killed = time.monotonic()
-        # Not by progress, which never falls: what a shard had told before is not told again.
-        again = server.bake_worker()
-        while busy([again], LOOK_SECONDS) < TRACING * LOOK_SECONDS * (os.cpu_count() or 1):
+        # Not by progress, which never falls: what a shard had told before is not told again. Looked for anew each time: at first the one
+        # that has been killed may still be there.
+        while busy([server.bake_worker()], LOOK_SECONDS) < TRACING * LOOK_SECONDS * (os.cpu_count() or 1):
             pass
         took.append(time.monotonic() - killed)
     return took
