@@ -6,7 +6,7 @@ else is float64, so differences from GLSL are GLSL's rounding (tests hold them t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -175,6 +175,15 @@ def cell(volume: VolumeData | Volume, positions: F64) -> tuple[I64, F64]:
     return base, g - base
 
 
+def corners(volume: VolumeData | Volume, base: I64) -> Iterator[tuple[I64, I64, I64]]:
+    """The eight probes of each cell in turn: where they are from the lowest, (3,), on the lattice, (m, 3), and in flat order, (m,)."""
+    counts = np.asarray(volume.counts)
+    for corner in range(8):
+        upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
+        lattice = np.minimum(base + upper, counts - 1)
+        yield upper, lattice, lattice @ np.array([1, counts[0], counts[0] * counts[1]])
+
+
 def _in_volume(volume: VolumeData, table: F64, positions: F64, normals: F64, wo: F64, toward: F64) -> tuple[F64, F64, I64]:
     """Mirrors ``obIrradianceInVolume``: irradiance, weights and probes; `table` is the volume's probe table, one row a probe."""
     normal_bias, view_bias = surface_bias(volume)
@@ -209,10 +218,7 @@ def blend(volume: VolumeData, table: F64, positions: F64, toward: F64, weigh: Ca
     oct_toward = dir_to_oct(toward)
     probes = np.empty((n, 8), np.int64)
     trilinear, other, light = np.empty((n, 8)), np.empty((n, 8)), np.empty((n, 8, 3))
-    for corner in range(8):
-        upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
-        lattice = np.minimum(base + upper, volume.counts - 1)
-        probe = lattice @ np.array([1, volume.counts[0], volume.counts[0] * volume.counts[1]])
+    for corner, (upper, lattice, probe) in enumerate(corners(volume, base)):
         kept = table[probe, 3] > 0
         # A probe without a tile reads the first one, and counts for nothing.
         tile = np.where(kept, table[probe, 3] - 1, 0).astype(np.int64)

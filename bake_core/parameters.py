@@ -20,7 +20,7 @@ from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.irradiance import sample
 from bake_core.receiver_irradiance import irradiance_at
 from bake_core.receivers import draw_receivers, stands_of
-from bake_core.relmse import RELMSE_FLOOR, relative_squares
+from bake_core.relmse import relative_squares
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
 
@@ -169,30 +169,28 @@ def _choose(scene: Scene, tracer: Tracer, ways: Sequence[VolumeData], points: in
     if change.mean() + _SURE * change.std() / np.sqrt(len(change)) >= -_WORTH * before.mean():
         best = _Tried(PARAMETERS, before)
     error, resolution = float(best.squares.mean()), 0
-    enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(ask(best.parameters)) + _LET_IN * float(size.mean())
-    for fewer in _as_the_highest(scene, tracer, ways, best.parameters):
-        answers = ask(best.parameters, fewer)
-        found = float(relative_squares(answers, estimates, bounded=True).mean())
-        if found <= enough and light_in_the_dark(answers) <= darkest:
-            error, resolution = found, fewer
+    if len(ways) > 1:
+        enough, darkest = (1 + _MARGIN) * error, light_in_the_dark(ask(best.parameters)) + _LET_IN * float(size.mean())
+        for fewer in _as_the_highest(scene, tracer, ways, best.parameters):
+            answers = ask(best.parameters, fewer)
+            found = float(relative_squares(answers, estimates, bounded=True).mean())
+            if found <= enough and light_in_the_dark(answers) <= darkest:
+                error, resolution = found, fewer
     return Choice(best.parameters, n, resolution, error, float(before.mean()))
 
 
 def _as_the_highest(scene: Scene, tracer: Tracer, ways: Sequence[VolumeData], parameters: dict[str, float]) -> list[int]:
-    """Which of the lower resolutions answer as the highest does, to a hundredth in the mean of squares (|·|² over that answer's).
+    """Which of the lower resolutions answer as the highest does, to a hundredth in the mean of relative squares.
 
     Not bounded: one nook that is lit from next door is a small part of any other mean. And nothing is traced, so many points are asked.
     """
-    if len(ways) == 1:
-        return []
     receivers = draw_receivers(scene, tracer, ways[:1], _MANY, _SEED)
     highest, *others = (sample([replace(way, parameters=parameters)], receivers.positions, receivers.normals).irradiance for way in ways)
-    size = (highest**2).sum(-1)
-    if not size.any():
+    if not highest.any():
         return []
-    scale = size + (RELMSE_FLOOR * np.sqrt(size).mean()) ** 2
-    apart = [float((((answers - highest) ** 2).sum(-1) / scale).mean()) for answers in others]
-    return [i for i, off in enumerate(apart, 1) if off <= _OFF]
+    # As many estimates as are asked for, all the same: an answer has no noise.
+    truth = np.broadcast_to(highest, (_SCRAMBLES, *highest.shape))
+    return [i for i, answers in enumerate(others, 1) if relative_squares(answers, truth).mean() <= _OFF]
 
 
 class _Tried(NamedTuple):

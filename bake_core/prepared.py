@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from bake_core.shader_constants import biases
 from bake_core.spec import Spec
 from bake_core.tracer import Tracer
 from bake_core.unneeded import unneeded
+
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -93,10 +96,9 @@ def prepare(
     whole = Tracer.build(scene, spec, environment)
     offsets, trials = _relocated(scene, spec, whole, volumes, positions, threads, trials)
     positions = positions + offsets
-    edges = np.cumsum([v.probe_count for v in volumes])[:-1]
     stand = [
         s if own.any() else _corners(v) - scene.origin
-        for v, s, own in zip(volumes, np.split(positions, edges), np.split(offsets, edges), strict=True)
+        for v, s, own in zip(volumes, _by_volume(volumes, positions), _by_volume(volumes, offsets), strict=True)
     ]
     selection = select(scene, spec, volumes, stand)
     shines = environment.sky is not None or bool(environment.constant.any())
@@ -126,21 +128,22 @@ def _relocated(
     known: tuple[Trial | None, ...] | None,
 ) -> tuple[NDArray[np.float32], tuple[Trial | None, ...]]:
     """Offsets of all volumes' probes in turn, and what was measured to decide on them."""
-    offsets = np.zeros(positions.shape, np.float32)
-    trials: list[Trial | None] = list(known or [None] * len(volumes))
     may = [spec.relocates(v.probe_count) for v in volumes]
-    if any(may):
-        found = relocate(tracer, volumes, positions)
-        first = 0
-        for i, volume in enumerate(volumes):
-            own = slice(first, first + volume.probe_count)
-            first = own.stop
-            if known is None and may[i] and spec.probes == "auto" and found[own].any():
-                trials[i] = try_relocation(scene, tracer, volume, found[own].astype(np.float64), 1 / len(volumes), threads=threads)
-            trial = trials[i]
-            if may[i] and (trial is None or trial.moved):
-                offsets[own] = found[own]
-    return offsets, tuple(trials)
+    if not any(may):
+        return np.zeros(positions.shape, np.float32), (None,) * len(volumes)
+    offsets, trials = _by_volume(volumes, relocate(tracer, volumes, positions)), list(known or [None] * len(volumes))
+    for i, volume in enumerate(volumes):
+        if known is None and may[i] and spec.probes == "auto" and offsets[i].any():
+            trials[i] = try_relocation(scene, tracer, volume, offsets[i].astype(np.float64), len(volumes), threads=threads)
+        trial = trials[i]
+        if not may[i] or (trial is not None and not trial.moved):
+            offsets[i] = np.zeros_like(offsets[i])
+    return np.concatenate(offsets), tuple(trials)
+
+
+def _by_volume(volumes: Sequence[Volume], values: NDArray[T]) -> list[NDArray[T]]:
+    """What all volumes' probes have in turn, volume by volume."""
+    return np.split(values, np.cumsum([v.probe_count for v in volumes])[:-1])
 
 
 def _corners(volume: Volume) -> NDArray[np.float64]:

@@ -73,9 +73,18 @@ def relocate(tracer: Tracer, volumes: Sequence[Volume], positions: F64) -> NDArr
     between = anything.all(-1) & wall.any(-1)
     offsets[between] = (ahead[..., 1] - ahead[..., 0])[between] / 2
     offsets = np.clip(offsets, -FARTHEST * spacing, FARTHEST * spacing)
-    free = np.ones(len(positions), np.bool_)
-    _free_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(positions), np.ascontiguousarray(offsets), free)
-    return np.where(free[:, None], offsets, 0).astype(np.float32)
+    moved = np.flatnonzero(offsets.any(-1))
+    # Nor may anything stand a quarter as far again behind its end.
+    stuck = moved[~is_free(tracer, positions[moved], 1.25 * offsets[moved])]
+    offsets[stuck] = 0
+    return offsets.astype(np.float32)
+
+
+def is_free(tracer: Tracer, origins: F64, ways: F64) -> NDArray[np.bool_]:
+    """Whether nothing lies on straight ways, (n, 3) metres, from origins, (n, 3), local frame; (n,) bool."""
+    free = np.empty(len(origins), np.bool_)
+    _free_kernel(tracer.tables, new_rayhit(), np.ascontiguousarray(origins), np.ascontiguousarray(ways), free)
+    return free
 
 
 @kernel
@@ -108,10 +117,8 @@ def _meet_kernel(t, ray, positions, direction, met):  # type: ignore[no-untyped-
 
 
 @entry_kernel
-def _free_kernel(t, ray, positions, offsets, free):  # type: ignore[no-untyped-def]
-    """Whether nothing is on the way, nor a quarter as far again behind its end."""
+def _free_kernel(t, ray, origins, ways, free):  # type: ignore[no-untyped-def]
     ray_bits = ray.view(np.uint32)
-    for p in range(positions.shape[0]):
-        dx, dy, dz = 1.25 * offsets[p, 0], 1.25 * offsets[p, 1], 1.25 * offsets[p, 2]
-        if dx != 0 or dy != 0 or dz != 0:
-            free[p] = not blocked(t, ray, ray_bits, positions[p, 0], positions[p, 1], positions[p, 2], dx, dy, dz, np.float32(1))
+    for i in range(origins.shape[0]):
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+        free[i] = not blocked(t, ray, ray_bits, x, y, z, ways[i, 0], ways[i, 1], ways[i, 2], np.float32(1))

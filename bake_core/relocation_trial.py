@@ -14,17 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.embree import new_rayhit
-from bake_core.irradiance import cell, crush, facing, tent
-from bake_core.kernels import entry_kernel
+from bake_core.irradiance import cell, corners, crush, facing, tent
 from bake_core.parameters import PARAMETERS
 from bake_core.placement import Volume
 from bake_core.receiver_irradiance import irradiance_at
 from bake_core.receivers import draw_receivers, stands_of
 from bake_core.relmse import RELMSE_FLOOR
+from bake_core.relocation import is_free
 from bake_core.scene import Scene
 from bake_core.shader_constants import biases
-from bake_core.surfaces import blocked
 from bake_core.tracer import Tracer
 
 F64 = NDArray[np.float64]
@@ -60,7 +58,7 @@ class Trial:
     moved: bool
 
 
-def try_relocation(scene: Scene, tracer: Tracer, volume: Volume, offsets: F64, share: float, *, threads: int) -> Trial | None:
+def try_relocation(scene: Scene, tracer: Tracer, volume: Volume, offsets: F64, among: int, *, threads: int) -> Trial | None:
     """Measure one volume with its probes at both places; they move where that takes 5 % off the error.
 
     Parameters
@@ -69,8 +67,8 @@ def try_relocation(scene: Scene, tracer: Tracer, volume: Volume, offsets: F64, s
         With the environment.
     offsets : (n, 3) float64
         From the lattice to the other places, metres.
-    share : float
-        Of the points of all volumes, which this one gets, at least 128.
+    among : int
+        Volumes that share the points, 128 each at least.
 
     Returns
     -------
@@ -78,7 +76,7 @@ def try_relocation(scene: Scene, tracer: Tracer, volume: Volume, offsets: F64, s
         None where there is nothing to measure at: too few surfaces that its probes see, or none that light reaches. The same for any
         number of threads.
     """
-    stands = stands_of(tracer, draw_receivers(scene, tracer, (_empty(volume),), max(round(_POINTS * share), _LEAST), _SEED).places)
+    stands = stands_of(tracer, draw_receivers(scene, tracer, (_empty(volume),), max(_POINTS // among, _LEAST), _SEED).places)
     n = len(stands)
     if n < _FEWEST:
         return None
@@ -108,21 +106,15 @@ def _error(answers: F64, truth: F64) -> float:
 def _answers(tracer: Tracer, volume: Volume, stands: F64, origin: F64, offsets: F64, threads: int) -> F64:
     """Four estimates of what a query answers at points, (4, n, 3)."""
     points, normals = stands[:, :3], stands[:, 6:9]
-    counts = np.asarray(volume.counts)
     base, fraction = cell(volume, points + origin)
-    normal_bias, _ = biases(PARAMETERS, volume.spacing, counts)
+    normal_bias, _ = biases(PARAMETERS, volume.spacing, np.asarray(volume.counts))
     biased = points + normals * normal_bias
     light, total = np.zeros((_SCRAMBLES, len(points), 3)), np.zeros(len(points))
-    for corner in range(8):
-        upper = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
-        lattice = np.minimum(base + upper, counts - 1)
-        offset = offsets[lattice @ np.array([1, counts[0], counts[0] * counts[1]])]
+    for corner, (upper, lattice, flat) in enumerate(corners(volume, base)):
+        offset = offsets[flat]
         probes = volume.origin - origin + volume.spacing * lattice + offset
-        hidden = np.zeros(len(points), np.bool_)
-        _hidden_kernel(tracer.tables, new_rayhit(), probes, biased, hidden)
-        weight = tent(fraction - upper, offset / volume.spacing) * crush(
-            facing(probes - points, normals) * np.where(hidden, PARAMETERS["visibility_floor"], 1)
-        )
+        seen = np.where(is_free(tracer, probes, biased - probes), 1, PARAMETERS["visibility_floor"])
+        weight = tent(fraction - upper, offset / volume.spacing) * crush(facing(probes - points, normals) * seen)
         asked = weight > 0
         stand = np.concatenate([probes, normals, normals, np.zeros((len(probes), 1))], 1)[asked]
         found = irradiance_at(tracer, stand, samples=_PATHS, scrambles=_SCRAMBLES, seed=_SEED + 1 + corner, threads=threads)
@@ -146,13 +138,3 @@ def _empty(volume: Volume) -> VolumeData:
         distance_limit=volume.distance_limit,
         atlases={},
     )
-
-
-@entry_kernel
-def _hidden_kernel(t, ray, probes, points, hidden):  # type: ignore[no-untyped-def]
-    """Whether something lies between probes and points, both (n, 3)."""
-    ray_bits = ray.view(np.uint32)
-    for i in range(probes.shape[0]):
-        x, y, z = probes[i, 0], probes[i, 1], probes[i, 2]
-        dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-        hidden[i] = blocked(t, ray, ray_bits, x, y, z, dx, dy, dz, np.float32(1))

@@ -161,10 +161,12 @@ def chosen_in_words(parameters: dict[str, float], chosen: dict[str, Any]) -> str
 
 def places_in_words(probes: dict[str, Any]) -> str:
     """What a manifest says of where a volume's probes stand, and what that was decided by."""
-    tried, moved = probes["tried"], probes["offsets"] is not None
-    error, other = (percent(max(tried[k], 0.0) ** 0.5) for k in (("error", "lattice_error") if moved else ("lattice_error", "error")))
-    where, elsewhere = ("nearer to walls", "on the lattice") if moved else ("on the lattice", "nearer to walls")
-    return f"{where}: error {error} at {tried['points']} points on surfaces, {other} {elsewhere}"
+    tried = probes["tried"]
+    near, lattice = (percent(max(tried[k], 0.0) ** 0.5) for k in ("error", "lattice_error"))
+    points = f"{tried['points']} points on surfaces"
+    if probes["offsets"] is None:
+        return f"on the lattice: error {lattice} at {points}, {near} nearer to walls"
+    return f"nearer to walls: error {near} at {points}, {lattice} on the lattice"
 
 
 def audit_in_words(audit: Audit) -> str:

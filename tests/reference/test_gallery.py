@@ -14,12 +14,11 @@ from bake_core.spec import load_spec, parse_spec
 from bake_core.thresholds import load_thresholds
 from bake_core.verification import verify
 from tests.baking import THREADS
+from tests.reference import gallery
 from tests.reference.gallery import OWN, PAGE, SCENES
 
 # Where the noise of fewer would be half of the limits: light that comes in through a door, or through narrow streets.
 SAMPLES = {"rtxgi_two_rooms": 16, "godot_zdm2": 64}
-# Of the reference: with fewer than the page has, a few paths that find the sun decide what godot_zdm2's dark streets are said to err by.
-PATHS = {"godot_zdm2": 64}
 
 
 @pytest.mark.slow
@@ -37,7 +36,8 @@ def test_a_shared_scene_keeps_its_limits(shared: Path, name: str, tmp_path: Path
         tmp_path / "out",
         width=192,
         height=108,
-        samples=PATHS.get(name, 32),
+        # As many as the page has where that has few: with fewer yet, some paths that find the sun would decide about dark streets.
+        samples=gallery.SAMPLES.get(name, 32),
         threads=THREADS,
         thresholds=load_thresholds(limits) if limits.is_file() else None,
     )

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 
 import pytest
 from octobake_client import Bake, JobFailed
 
 from tests import chromium
-from tests.service.running import BOX, Server, box_spec
+from tests.service.figures.work import add_box
+from tests.service.running import Server, box_spec
 
-SCENE = "sha256:" + hashlib.sha256(BOX).hexdigest()
 # Of the page's own time, which runs ahead while nothing is on its way: until all that it asks for has come.
 ENOUGH = "--virtual-time-budget=10000"
 
@@ -25,9 +24,9 @@ def seen(server: Server, path: str) -> str:
 def test_pages_tell_how_a_bake_went(server: Server) -> None:
     chromium.needed("a browser")
     with server.client() as client:
-        client._send("POST", "/v1/scenes", content=BOX)
-        good = client.wait(client.submit(SCENE, box_spec(32, (2, 2, 2)))).check()
-        body = {"scene": SCENE, "spec": box_spec(48, (2, 2, 2)), "limits": {"memory_bytes": 1 << 20}}
+        scene = add_box(server)
+        good = client.wait(client.submit(scene, box_spec(32, (2, 2, 2)))).check()
+        body = {"scene": scene, "spec": box_spec(48, (2, 2, 2)), "limits": {"memory_bytes": 1 << 20}}
         bad = Bake.of(client._send("POST", "/v1/bakes", json=body).json())
         with pytest.raises(JobFailed):
             client.wait(bad).check()

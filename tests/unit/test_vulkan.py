@@ -13,7 +13,7 @@ import pytest
 from bake_core.errors import MachineError
 from bake_core.shader_compiler import compile_glsl
 from bake_core.vulkan import Bindings, Device, Draw, color_target, compute_pipeline, depth_target, graphics_pipeline, storage, texture
-from tests.chromium import SWIFTSHADER
+from tests import chromium
 
 DOUBLE = """#version 450
 layout(local_size_x = 64) in;
@@ -80,9 +80,9 @@ def test_an_image_or_a_buffer_larger_than_the_device_takes_is_refused() -> None:
     assert caught.value.slug == "vulkan.buffer_too_large"
 
 
-@pytest.mark.skipif(not SWIFTSHADER.is_file(), reason="SwiftShader comes with Chromium; `make chromium` fetches it")
 def test_the_environment_names_another_driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VK_DRIVER_FILES", str(SWIFTSHADER))
+    chromium.needed("SwiftShader")
+    monkeypatch.setenv("VK_DRIVER_FILES", str(chromium.SWIFTSHADER))
     with Device() as device:
         assert "SwiftShader" in device.name
 
