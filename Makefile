@@ -69,6 +69,7 @@ bench: setup
 	$(BIN)/octobake bench targets -o out/bench --targets 0.05,0.02
 	$(BIN)/octobake bench adaptive -o out/bench --runs 1
 	$(BIN)/octobake bench leaving-out -o out/bench --runs 1
+	$(BIN)/octobake bench integrators -o out/bench --runs 1
 
 service-figures: setup
 	$(BIN)/python -m tests.service.figures $(ARGS)

@@ -63,6 +63,7 @@ def assemble(
     left_out: tuple[LeftOut, ...],
     state: State,
     stopped: Verdict,
+    cached: float | None,
     folder: Path,
     choose: Callable[[Sequence[Sequence[VolumeData]]], list[Choice]] = default_choices,
 ) -> dict[str, Any]:
@@ -76,6 +77,8 @@ def assemble(
         What was measured of each volume to decide on them.
     left_out : tuple of LeftOut
         Outputs and all else.
+    cached : float or None
+        The share of what probes see that was in the light cache at first; None where every path was traced to its end.
     choose : callable
         What each volume's query uses, by the volumes as they may be read: each once for each resolution of its visibility.
 
@@ -119,7 +122,7 @@ def assemble(
         "spec": spec.canonical(),
         "samples": state.samples,
         "stopped": stopped,
-        "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples()},
+        "sampling": {"mean_samples": state.mean_samples(), "uniform_samples": state.uniform_samples(), "cached": cached},
         "error": _error(spec, volumes, selection, state),
         "left_out": [x.entry() for x in left_out] + _left_out_probes(state, saved) + _left_out_channels(entries, data),
         "volumes": entries,
@@ -327,7 +330,9 @@ def _interior(output: OutputName, selection: Selection, state: State, probes: sl
             # error.
             mean = np.maximum(state.mean(probes), 0)
             return np.asarray(mean, np.float32).reshape(-1, selection.irradiance, selection.irradiance, 3)
-        return np.asarray(state.mean_radiance(probes), np.float32).reshape(-1, selection.capture, selection.capture, 3)
+        # So can a scramble's version of a cell in the light cache, where few scrambles have had a sample.
+        mean = np.maximum(state.mean_radiance(probes), 0)
+        return np.asarray(mean, np.float32).reshape(-1, selection.capture, selection.capture, 3)
 
 
 def _write_layers(path: Path, texels: F32, channels: tuple[str, ...], *, half: bool) -> None:

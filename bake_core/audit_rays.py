@@ -116,7 +116,7 @@ def _sphere_kernel(t, ray, positions, normals, first, samples, seed, cancelled, 
                 d = (sine * math.cos(phi), sine * math.sin(phi), dz)
                 # Of no width: a look-up in a texture that is as fine as it can be is no estimate of what a wider one would have found.
                 emitted, direct, indirect, _, light_pdf = trace_path(
-                    t, ray, ray_bits, x, y, z, d[0], d[1], d[2], reversed_index, index, key, False, 0.0
+                    t, ray, ray_bits, x, y, z, d[0], d[1], d[2], reversed_index, index, key, False, 0.0, 0
                 )
                 share = _UNIFORM_PDF / (_UNIFORM_PDF + light_pdf)
                 radiance = (

@@ -72,6 +72,8 @@ def empty_state(prepared: Prepared) -> State:
 def compile_kernels(prepared: Prepared, *, audited: bool) -> None:
     """Compile, or fetch from the cache on disk, every kernel that a bake runs, and its audit: by tracing no probe at all."""
     trace_shard(prepared, (0, 0), (0, 0), Allocation.start(0), threads=1)
+    if prepared.light is not None:
+        prepared.light.compile()
     compile_choice(prepared.scene, prepared.whole)
     if audited:
         compile_audit(prepared.whole)
@@ -189,6 +191,7 @@ def finish(
                 prepared.left_out,
                 state,
                 run.stopped,
+                None if prepared.light is None else prepared.light.cached,
                 work,
                 lambda volumes: choose_parameters(prepared.scene, prepared.whole, volumes, threads=run.threads),
             )

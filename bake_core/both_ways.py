@@ -20,6 +20,7 @@ from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.spec import OUTPUTS, Spec
+from bake_core.surface_light import surface_light
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,12 @@ class BothWays:
         return sorted(name for name in self.without.digests if name not in self.same)
 
 
-def everything(scene: Scene, spec: Spec, find: Find = no_images) -> Prepared:
+def everything(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 1) -> Prepared:
     """A bake that leaves out no output, no probe that stands outside solids, no environment, nor code for textures, holes and gloss."""
     prepared = prepare(scene, spec.model_copy(update={"outputs": OUTPUTS, "receivers": "everywhere"}), find)
     whole = prepared.whole.general(scene)
-    return replace(prepared, tracer=whole, whole=whole)
+    light = surface_light(spec, whole, prepared.positions, prepared.units, prepared.selection.capture**2, threads=threads)
+    return replace(prepared, tracer=whole, whole=whole, light=light)
 
 
 def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> BothWays:
@@ -78,7 +80,7 @@ def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -
         As a bake would.
     """
     without, ours = _bake(prepare(scene, spec, find, threads=threads), threads)
-    with_all, theirs = _bake(everything(scene, spec, find), threads)
+    with_all, theirs = _bake(everything(scene, spec, find, threads=threads), threads)
     # Of probes that one bake has and the other has not there is nothing to compare.
     kept = [(a.states == 1) & (b.states == 1) for a, b in zip(ours, theirs, strict=True)]
     return BothWays(replace(without, digests=_digests(ours, kept)), replace(with_all, digests=_digests(theirs, kept)))

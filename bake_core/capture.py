@@ -204,8 +204,9 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
                         length = math.sqrt(a * a + b * b + c * c)
                         dx, dy, dz = a / length, b / length, c / length
                         density = texels / 4 * (length * length * length)
+                        width = math.sqrt(1 / density)
                         emitted, direct, indirect, _, light_pdf = trace_path(
-                            t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, path_key, False, math.sqrt(1 / density)
+                            t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, path_key, False, width, scramble
                         )
                         red, green, blue = (
                             emitted[0] + direct[0] + indirect[0],

@@ -126,7 +126,7 @@ def import_cubemaps(folder: Path, out: Path) -> dict[str, Any]:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as work:
             target = Path(work) / "bundle"
             target.mkdir()
-            manifest = assemble(source, spec, volumes, offsets, untried, selection, (), state, "samples", target) | {"samples": 0}
+            manifest = assemble(source, spec, volumes, offsets, untried, selection, (), state, "samples", None, target) | {"samples": 0}
             written = bundle.dump_json(manifest)
             (target / bundle.MANIFEST).write_bytes(written)
             report.write(target, manifest, bundle.content_digest(written), Run(1, 1, stopped="samples"))

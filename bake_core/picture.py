@@ -74,7 +74,7 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
                 length = math.sqrt(dx * dx + dy * dy + dz * dz)
                 dx, dy, dz, spread = dx / length, dy / length, dz / length, pixel / length
                 emitted, direct, indirect, hit, _ = trace_path(
-                    t, ray, ray_bits, eye[0], eye[1], eye[2], dx, dy, dz, reversed_index, index, key, True, spread
+                    t, ray, ray_bits, eye[0], eye[1], eye[2], dx, dy, dz, reversed_index, index, key, True, spread, 0
                 )
                 for c in range(3):
                     out[row, column, c] += emitted[c]

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,11 @@ from bake_core.environment import Find, no_images
 from bake_core.prepared import Prepared, needed_probes, prepare
 from bake_core.scene import Scene
 from bake_core.selection import LeftOut
-from bake_core.shards import trace_shard
+from bake_core.shards import lit, trace_shard
 from bake_core.spec import Spec, Stop
-from bake_core.tally import Tally
 
 F64 = NDArray[np.float64]
+T = TypeVar("T")
 
 # Probes that are traced to learn a scene's speed and noise; each gets the samples of a bake's own pilot.
 _PILOT_PROBES = 32
@@ -112,6 +113,8 @@ class Pilot:
         What active ones have had, and what they are to have.
     times : float
         How many times as many probes the bake traces.
+    learning_seconds : float
+        What the light cache takes for a sample of the whole bake.
     """
 
     seconds: F64
@@ -122,6 +125,7 @@ class Pilot:
     fall: float
     allocation: Allocation
     times: float
+    learning_seconds: float
 
     def cost(self, taken: F64) -> F64:
         """(p,) float64: seconds for each probe, where active ones take so many samples, (a,)."""
@@ -150,7 +154,9 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     traced = int(prepared.needed.sum())
 
     def seconds(taken: F64) -> float:
-        return traced * float(pilot.cost(taken).mean()) if traced else 0.0
+        if not traced:
+            return 0.0
+        return traced * float(pilot.cost(taken).mean()) + pilot.learning_seconds * float(taken.max(initial=0.0))
 
     per_sample = float(pilot.seconds.mean()) if traced else 0.0
     return Plan(
@@ -174,6 +180,7 @@ def contents(prepared: Prepared) -> Contents:
     edges = np.cumsum([0] + [v.probe_count for v in prepared.volumes])
     sizes = [sum(s.map_bytes(o) for o in s.of(i)) for i in range(len(prepared.volumes))]
     stored = sum(size * int(prepared.needed[a:b].sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True))
+    cache = 0 if prepared.light is None else prepared.light.bytes(spec.stop.max_samples)
     return Contents(
         volumes=tuple(PlannedVolume(v.name, tuple(v.origin.tolist()), tuple(v.spacing.tolist()), v.counts) for v in prepared.volumes),
         probes=n,
@@ -181,7 +188,7 @@ def contents(prepared: Prepared) -> Contents:
         left_out=prepared.left_out,
         unneeded_probes=n - int(asked.sum()),
         unneeded_bytes=sum(size * int((~asked[a:b]).sum()) for size, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)),
-        memory_bytes=int(_BASE_BYTES + scene.triangle_count * _BVH_BYTES + scene.positions.nbytes * 3 + 2 * state_bytes + 2 * stored),
+        memory_bytes=int(_BASE_BYTES + scene.triangle_count * _BVH_BYTES + scene.positions.nbytes * 3 + 2 * (state_bytes + stored) + cache),
         atlas_bytes=stored,
     )
 
@@ -228,7 +235,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     count = min(_PILOT_PROBES, len(wanted))
     if not count:
         nothing = np.zeros(0)
-        return Pilot(nothing, 0.0, np.zeros(0, np.bool_), nothing, 1, 1.0, Allocation.start(0), 1.0)
+        return Pilot(nothing, 0.0, np.zeros(0, np.bool_), nothing, 1, 1.0, Allocation.start(0), 1.0, 0.0)
     # Every so-many-th would be a diagonal through the grid.
     within = np.random.default_rng(prepared.spec.seed).random(count)
     chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
@@ -241,6 +248,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     alone = [trace_shard(few, (probe, probe + 1), first, start, threads=threads) for probe in range(count)]
     state.add(alone)
     early = state.spread()
+    _, learning = _timed(lambda: lit(few, second, threads=threads))
     together, tracing = _timed(lambda: trace_shard(few, (0, count), second, state.allocation, threads=threads))
     state.add([together])
     late = state.spread()
@@ -260,9 +268,10 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
         fall=min(max(fell, 1.0), _STEEPEST),
         allocation=Allocation(state.taken[active], state.eighths[active]),
         times=len(wanted) / count,
+        learning_seconds=learning / (second[1] - second[0]),
     )
 
 
-def _timed(trace: Callable[[], Tally]) -> tuple[Tally, float]:
+def _timed(trace: Callable[[], T]) -> tuple[T, float]:
     started = time.perf_counter()
     return trace(), time.perf_counter() - started

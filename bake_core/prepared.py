@@ -20,6 +20,7 @@ from bake_core.sealed import is_sealed
 from bake_core.selection import LeftOut, Selection, select
 from bake_core.shader_constants import biases
 from bake_core.spec import Spec
+from bake_core.surface_light import SurfaceLight, surface_light
 from bake_core.tracer import Tracer
 from bake_core.unneeded import unneeded
 
@@ -46,6 +47,8 @@ class Prepared:
         What probes are traced with.
     whole : Tracer
         The scene as it is: what audits look at. It has an environment that `tracer` may do without.
+    light : SurfaceLight or None
+        The cache of indirect light that passes read; None where every path is traced to its end.
     """
 
     scene: Scene
@@ -60,6 +63,7 @@ class Prepared:
     limits: NDArray[np.float64]
     units: NDArray[np.float64]
     needed: NDArray[np.bool_]
+    light: SurfaceLight | None
 
     @property
     def probe_count(self) -> int:
@@ -101,20 +105,23 @@ def prepare(
         for v, s, own in zip(volumes, _by_volume(volumes, positions), _by_volume(volumes, offsets), strict=True)
     ]
     selection = select(scene, spec, volumes, stand)
+    units = np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes])
     shines = environment.sky is not None or bool(environment.constant.any())
+    tracer = whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole
     return Prepared(
         scene=scene,
         spec=spec,
         volumes=volumes,
         selection=selection,
-        tracer=whole.without_environment() if shines and is_sealed(scene, whole, positions) else whole,
+        tracer=tracer,
         whole=whole,
         positions=positions,
         offsets=offsets,
         trials=trials,
         limits=np.concatenate([np.full(v.probe_count, v.distance_limit) for v in volumes]),
-        units=np.concatenate([np.full(v.probe_count, v.spacing.min()) for v in volumes]),
+        units=units,
         needed=needed_probes(scene, volumes) if spec.receivers == "surfaces" else np.ones(len(positions), np.bool_),
+        light=surface_light(spec, tracer, positions, units, selection.capture**2, threads=threads),
     )
 
 

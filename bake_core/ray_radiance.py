@@ -43,7 +43,7 @@ def _radiance_kernel(t, ray, lines, first, samples, seed, cancelled, out):  # ty
             for sample in range(samples):
                 index = uint32(sample)
                 emitted, direct, indirect, _, _ = trace_path(
-                    t, ray, ray_bits, line[0], line[1], line[2], line[3], line[4], line[5], reverse_bits(index), index, key, False, 0.0
+                    t, ray, ray_bits, line[0], line[1], line[2], line[3], line[4], line[5], reverse_bits(index), index, key, False, 0.0, 0
                 )
                 red += emitted[0] + direct[0] + indirect[0]
                 green += emitted[1] + direct[1] + indirect[1]

@@ -162,7 +162,7 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
                 dx, dy, dz = sample_lambert(u, v, n)
                 # Of no width: a look-up in a texture that is as fine as it can be is no estimate of what a wider one would have found.
                 emitted, direct, indirect, _, light_pdf = trace_path(
-                    t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, False, 0.0
+                    t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, False, 0.0, 0
                 )
                 pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
                 share = pdf / (pdf + light_pdf) if light_pdf > 0 else 1.0

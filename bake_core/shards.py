@@ -15,6 +15,7 @@ from bake_core.capture import Capture, capture_distance, capture_radiance
 from bake_core.octahedral import texel_solid_angles
 from bake_core.prepared import Prepared
 from bake_core.tally import Tally, outside
+from bake_core.tracer import Tracer
 from bake_core.walls import moments_and_walls
 
 # Probes whose distances are held at once: 64² rays of 33 bytes each, 9 MB a thread.
@@ -73,7 +74,7 @@ def trace_shard(
     else:
         kept = allocation.eighths[slice(*probes)].max(1) > 0
     irradiance, radiance, rays = capture_radiance(
-        prepared.tracer,
+        lit(prepared, samples, threads=threads, cancelled=flag),
         np.ascontiguousarray(positions[kept]),
         ids[kept],
         np.ascontiguousarray(spans[kept]),
@@ -95,6 +96,21 @@ def trace_shard(
         normal=seen.get("normal", empty((0, 0, 0), np.float32)),
         rays=rays + looked,
     )
+
+
+def lit(prepared: Prepared, samples: tuple[int, int], *, threads: int, cancelled: NDArray[np.uint8] | None = None) -> Tracer:
+    """What a pass traces with: a light cache in it, unless every path is to go on to its end.
+
+    Raises
+    ------
+    Cancelled
+    """
+    light = prepared.light
+    if light is None:
+        return prepared.tracer
+    if samples[0] == samples[1]:
+        return light.blank()
+    return light.tracer(samples[1], threads=threads, cancelled=np.zeros(1, np.uint8) if cancelled is None else cancelled)
 
 
 def _spread(values: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:

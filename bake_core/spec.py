@@ -170,6 +170,7 @@ class Spec(_Model):
     receivers: Literal["everywhere", "surfaces"] = "everywhere"
     probes: Literal["auto", "lattice", "relocated"] = "auto"
     resolution: Resolution = Resolution()
+    integrator: Literal["auto", "path", "cache"] = "auto"
     max_bounces: Annotated[Whole, Field(ge=0, le=MAX_BOUNCES)] | None = None
     stop: Stop = Stop()
     seed: Annotated[Whole, Field(ge=0, lt=1 << 64)] = 0

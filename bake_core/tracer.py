@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bake_core import embree
 from bake_core.environment import Environment, Sky
 from bake_core.ggx_albedo import AlbedoTable, albedo_table
+from bake_core.light_cache import LightCache
 from bake_core.lights import EmitterTable, LightTable, emitter_table, light_table, merge_lights
 from bake_core.materials import MaterialTable, gloss_table, material_table
 from bake_core.ray_log import RayLog
@@ -36,6 +37,8 @@ class Tables(NamedTuple):
     item_first_triangle : (1 + i,) int64
     item_transform, item_normal : (1 + i, 3, 4) and (1 + i, 3, 3) float64
         Of points, and of normals up to a positive factor.
+    cache : LightCache, optional
+        Where paths end that it knows the rest of.
     log : RayLog, optional
         Where every query is written down. Kernels for tables with one are compiled apart, so that it costs the others nothing.
     """
@@ -56,6 +59,7 @@ class Tables(NamedTuple):
     environment: NDArray[np.float64]
     sky: Sky | None
     max_bounces: np.int64
+    cache: LightCache | None = None
     log: RayLog | None = None
 
 

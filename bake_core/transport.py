@@ -14,6 +14,7 @@ from numba import uint64
 from bake_core.embree import set_ray
 from bake_core.environment import environment_radiance, has_sky
 from bake_core.kernels import kernel
+from bake_core.light_cache import cached_light
 from bake_core.materials import INV_PI, gloss, is_glossy, lambert_cosine, no_gloss, sample_gloss, sample_lambert, scattered
 from bake_core.next_event import emitter_strength, from_emitters, from_lights, from_sky, pdf_emitter
 from bake_core.ray_log import ask_nearest
@@ -42,7 +43,7 @@ def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-d
 
 
 @kernel
-def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread):  # type: ignore[no-untyped-def]
+def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble):  # type: ignore[no-untyped-def]
     """One path.
 
     Parameters
@@ -58,6 +59,8 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         Whether the ray itself passes through back faces of single-sided materials, as a rasteriser's does that culls them.
     spread : float
         Width of what the ray stands for, radians: the square root of its solid angle. Textures are averaged over it.
+    scramble : int
+        Whose cache to read, where there is one.
 
     Returns
     -------
@@ -189,6 +192,13 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                     indirect_r += beta_r / survival * r
                     indirect_g += beta_g / survival * g
                     indirect_b += beta_b / survival * b
+        if not glossy:
+            known, r, g, b = cached_light(t, ray, ray_bits, scramble, depth, p, n, epsilon)
+            if known:
+                indirect_r += beta_r / survival * r
+                indirect_g += beta_g / survival * g
+                indirect_b += beta_b / survival * b
+                break
         bsdf_u, bsdf_v = sample_pair(reversed_index, index, depth, vertex)
         if glossy:
             dx, dy, dz = sample_gloss(t, look, np.float64(bsdf_u), np.float64(bsdf_v), n)

@@ -148,9 +148,10 @@ class Convergence:
 class _Ours:
     """Bakes with exactly so many samples; the seconds are those of tracing."""
 
-    def __init__(self, scene: Path, spec: Spec, find: Find, threads: int, folder: Path) -> None:
-        self._scene, self._spec, self._find, self._threads, self._folder = scene, spec, find, threads, folder
-        self.name = "octobake, path"
+    def __init__(self, scene: Path, spec: Spec, find: Find, threads: int, folder: Path, integrator: str = "path") -> None:
+        self._scene, self._find, self._threads, self._folder = scene, find, threads, folder
+        self._spec = spec.model_copy(update={"integrator": integrator})
+        self.name = f"octobake, {integrator}"
         self._stages: dict[str, float] = {}
         self.render(1, 0)
         self.load, self.compile = self._stages["reading"] + self._stages["building"], self._stages["compiling"]
@@ -234,8 +235,8 @@ def measure(
     prepared = prepare(load_scene(scene_path), spec, find)
     with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder, ExitStack() as stack:
         truth = _reference(scene_path, spec, prepared.volumes, find, threads, reference_samples, reference, side, Path(folder), say)
-        ours = _Ours(scene_path, spec, find, threads, Path(folder))
-        racing: list[_Ours | Peer] = [ours]
+        integrators = ("path", "cache") if prepared.tracer.tables.max_bounces > 1 else ("path",)
+        racing: list[_Ours | Peer] = [_Ours(scene_path, spec, find, threads, Path(folder), i) for i in integrators]
         left_out = []
         given: dict[str, Any] | None = None
         found = find_peers(peers)

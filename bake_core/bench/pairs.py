@@ -1,4 +1,4 @@
-"""Two ways to bake the same, in turns: adaptive sampling against uniform, leaving out against keeping everything."""
+"""Two ways to bake the same, in turns: adaptive sampling against uniform, leaving out against not, the light cache against paths."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from bake_core.drawing import Drawing
 from bake_core.report import percent
 from bake_core.spec import OUTPUTS, Stop
 
-Question = Literal["adaptive", "leaving-out"]
+Question = Literal["adaptive", "leaving-out", "integrators"]
 
 
 @dataclass(frozen=True)
 class Way:
-    """One of the two: what is demanded of the spec, and how it is baked."""
+    """One of the two: what of the spec it changes, and how it is baked."""
 
     name: str
-    outputs: tuple[str, ...] | None
+    changes: dict[str, Any]
     options: dict[str, Any]
 
 
 WAYS: dict[Question, tuple[Way, Way]] = {
-    "adaptive": (Way("adaptive", None, {}), Way("uniform", None, {"adaptive": False})),
-    "leaving-out": (Way("left out", None, {}), Way("all five outputs", OUTPUTS, {})),
+    "adaptive": (Way("adaptive", {}, {}), Way("uniform", {}, {"adaptive": False})),
+    "leaving-out": (Way("left out", {}, {}), Way("all five outputs", {"outputs": OUTPUTS}, {})),
+    "integrators": (Way("auto", {}, {}), Way("path", {"integrator": "path"}, {})),
 }
 
 
@@ -144,12 +145,12 @@ def measure(
         for subject in subjects:
             baked: tuple[list[Baked], list[Baked]] = ([], [])
             for way in WAYS[question]:
-                warm_up(subject, threads, Path(folder), way.outputs, **way.options)
+                warm_up(subject, threads, Path(folder), way.changes, **way.options)
             for run in range(runs):
                 turns = list(zip(WAYS[question], baked, strict=True))
                 # Whoever goes first in one run goes second in the next: neither always finds what the other has left in caches.
                 for way, done in turns if run % 2 == 0 else reversed(turns):
-                    done.append(bake_to(subject, stop, threads, Path(folder), way.outputs, **way.options))
+                    done.append(bake_to(subject, stop, threads, Path(folder), way.changes, **way.options))
                     b = done[-1]
                     told = f"{b.samples} samples, error {percent(b.stated)}, {b.tracing:.2f} s of tracing"
                     say(f"{subject.name}, run {run + 1}/{runs}, {way.name}: {told}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -60,10 +60,10 @@ class Baked:
     rate: Rate
 
 
-def bake_to(subject: Subject, stop: Stop, threads: int, folder: Path, outputs: Any = None, **options: Any) -> Baked:
-    """Bake with a stop of its own; options are those of :func:`bake_core.bake.bake`."""
+def bake_to(subject: Subject, stop: Stop, threads: int, folder: Path, changes: Mapping[str, Any] | None = None, **options: Any) -> Baked:
+    """Bake with a stop of its own, and with changes to the spec; options are those of :func:`bake_core.bake.bake`."""
     out = folder / "bundle"
-    update: dict[str, Any] = {"stop": stop} | ({} if outputs is None else {"outputs": outputs})
+    update: dict[str, Any] = {**(changes or {}), "stop": stop}
     result = bake(subject.scene, subject.spec.model_copy(update=update), out, threads=threads, find=beside(subject.images), **options)
     report = json.loads((out / "report.json").read_bytes())
     run, began = result.run, result.run.began or 0.0
@@ -85,9 +85,9 @@ def bake_to(subject: Subject, stop: Stop, threads: int, folder: Path, outputs: A
     )
 
 
-def warm_up(subject: Subject, threads: int, folder: Path, outputs: Any = None, **options: Any) -> None:
+def warm_up(subject: Subject, threads: int, folder: Path, changes: Mapping[str, Any] | None = None, **options: Any) -> None:
     """Bake one sample, so that no measured bake loads or compiles kernels."""
-    bake_to(subject, Stop(target_error=None, max_samples=1), threads, folder, outputs, **options)
+    bake_to(subject, Stop(target_error=None, max_samples=1), threads, folder, changes, **options)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 
+# Those of the spec; importing it takes longer than all else that a help text needs.
+INTEGRATORS = ("auto", "path", "cache")
+
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("bake", help="bake a scene here, with no server")
@@ -19,6 +22,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, required=True, help="a folder, or a zip where it ends in .zip")
     parser.add_argument("--threads", type=positive, default=os.cpu_count() or 1, help="default: all cores")
     parser.add_argument("--shards", type=positive, default=1, help="split each pass into this many parts; the bundle is the same")
+    parser.add_argument("--integrator", choices=INTEGRATORS, help="in place of the spec's: path traces every path to its end")
     parser.add_argument("--audit-seconds", type=seconds, metavar="S", help="what the audit may take; default 3 %% of the bake, 0 for none")
     parser.add_argument("--json", action="store_true", help="print one JSON document: bundle, digest, error, seconds, curve, audit")
     parser.set_defaults(run=run)
@@ -52,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
     from service.cli.progress import ProgressLine
 
     spec = load_spec(args.spec)
+    if args.integrator is not None:
+        spec = spec.model_copy(update={"integrator": args.integrator})
     cancelled = np.zeros(1, np.uint8)
     line = ProgressLine(sys.stderr)
 

@@ -54,6 +54,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     pairs = (
         kinds.add_parser("adaptive", parents=[shared], help="adaptive sampling against uniform, at equal error"),
         kinds.add_parser("leaving-out", parents=[shared], help="leaving out what a scene does not need against all five outputs"),
+        kinds.add_parser("integrators", parents=[shared], help="the light cache, where auto takes it, against paths traced to their ends"),
     )
     for pair in pairs:
         pair.add_argument("scenes", metavar="SCENE", nargs="*", type=Path, help=_SCENES)

@@ -30,7 +30,8 @@ _PROBES, _DIRECTIONS, _FINEST = 64, 2000, 16
 def traced(scene: str, **changes: Any) -> State:
     """Probes spread evenly through a shared scene's bake, after a pilot's samples; the same random numbers for any resolution."""
     path = SHARED / "specs" / f"{scene}.json"
-    prepared = prepare(load_scene(SHARED / "scenes" / f"{scene}.glb"), load_spec(path).model_copy(update=changes), beside(path.parent))
+    spec = load_spec(path).model_copy(update={"integrator": "path", **changes})
+    prepared = prepare(load_scene(SHARED / "scenes" / f"{scene}.glb"), spec, beside(path.parent))
     chosen = np.unique(np.linspace(0, prepared.probe_count - 1, _PROBES).astype(int))
     positions, limits, units = (a[chosen] for a in (prepared.positions, prepared.limits, prepared.units))
     few = replace(prepared, positions=positions, limits=limits, units=units)

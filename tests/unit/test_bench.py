@@ -95,8 +95,9 @@ def test_convergence_without_peers(scene: Path, capsys: pytest.CaptureFixture[st
     printed, said = capsys.readouterr()
     assert said.count("no peer is installed: ours alone is measured") == 1
     document, rows = left(out, "convergence")
-    assert [(r["contestant"], r["samples"]) for r in rows] == [("octobake, path", "16"), ("octobake, path", "64")]
-    first, second = document["measured"]
+    raced = [(f"octobake, {integrator}", samples) for integrator in ("path", "cache") for samples in ("16", "64")]
+    assert [(r["contestant"], r["samples"]) for r in rows] == raced
+    first, second, *_ = document["measured"]
     assert second["relative_mse"] < first["relative_mse"] and abs(second["bias"]) < 4 * second["bias_error"] + 1e-3
     assert document["probes"] == 4 and document["reference_noise"] < second["relative_mse"]
     assert printed.splitlines()[0].startswith("integrator") and "Reference: ours, path traced" in printed
@@ -122,7 +123,7 @@ def test_targets(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert text.startswith("# Mine\n") and text.endswith("after\n") and "old" not in text and "| plane | 5 % |" in text
 
 
-@pytest.mark.parametrize("kind", ["adaptive", "leaving-out"])
+@pytest.mark.parametrize("kind", ["adaptive", "leaving-out", "integrators"])
 def test_pairs(scene: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     out = bench(kind, scene, "--target", "0.1", "--runs", "1", "--max-samples", "256")
     document, rows = left(out, kind)

@@ -67,6 +67,7 @@ def test_everything_but_volumes_has_a_default() -> None:
         "receivers": "everywhere",
         "probes": "auto",
         "resolution": {"irradiance": 8, "visibility": 16, "radiance": None, "distance": 64, "normal": 64},
+        "integrator": "auto",
         "max_bounces": None,
         "stop": {"target_error": 0.02, "max_seconds": None, "max_samples": 256},
         "seed": 0,

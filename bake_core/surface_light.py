@@ -1,0 +1,190 @@
+"""The light cache over a bake's passes: each stage is a function of scene, spec and its number alone, so that any process can make it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bake_core.allocation import HALVES, SCRAMBLES
+from bake_core.cache_cells import FEWEST, average, codes
+from bake_core.cache_points import Points, find_points, gather_light
+from bake_core.convergence import FIRST_SAMPLES
+from bake_core.light_cache import AXIS_CELLS, LightCache, empty_cache
+from bake_core.spec import Spec
+from bake_core.tracer import Tracer
+
+F64 = NDArray[np.float64]
+Flag = NDArray[np.uint8]
+
+# Paths that the cache learns from, over those that read it: where squared error times seconds is least, which is a flat valley.
+_SHARE = 0.5
+# From one point in the first stage: its ray from the probe costs little beside them.
+_PATHS = 32
+# Probes that points are looked for from, and points in the end: what a large bake holds of them, some 600 MB.
+_MOST_PROBES, _MOST_POINTS = 1 << 14, 1 << 21
+# The smallest cells of the first stage, in the smallest spacing of probes; how many sizes there are up to the largest spacing.
+_SMALLEST = 1 / 8
+_SIZES = 4
+_MOST_SIZES = 12
+# Fewer probes have nothing to share.
+FEWEST_PROBES = 64
+# Of what probes see, this much must be in the cache for it to pay.
+_COVERED = 0.5
+# A point twice, while cells are made of it; a cell with its place in the table, in all sizes together.
+_POINT_BYTES, _CELL_BYTES = 2 * 114, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
+_SEED = 0x11C4C3E5
+
+
+class SurfaceLight:
+    """What is known of the light on surfaces when a pass begins.
+
+    Stage s is what a bake of 16 · 2ˢ samples learns from: half as many paths as it traces itself, from points that its probes see. Both
+    the points and the paths from each grow, and every second stage cells are half as large, so that what they smooth away goes to zero
+    as well. In the first stage a quarter of the points are path-traced to their ends, and the others' paths end in those.
+
+    Parameters
+    ----------
+    tracer : Tracer
+        Without a cache.
+    positions : (n, 3) float64
+        Of all probes, local frame.
+    units : (n,) float64
+        Each one's smallest spacing, metres.
+    texels : int
+        Of a probe's capture map.
+
+    Attributes
+    ----------
+    cached : float
+        The share of what probes see that was known at first, once :meth:`survey` has looked.
+    """
+
+    def __init__(self, tracer: Tracer, positions: F64, units: F64, texels: int, seed: int) -> None:
+        self.cached = 0.0
+        self._tracer, self._seed = tracer, seed ^ _SEED
+        some = np.random.default_rng(self._seed).permutation(len(positions))[:_MOST_PROBES]
+        self._positions = np.ascontiguousarray(positions[np.sort(some)])
+        self._smallest, self._largest = float(units.min()), float(units.max())
+        self._each = max(round(_SHARE * texels * FIRST_SAMPLES / SCRAMBLES / _PATHS), 1)
+        self._lock = threading.Lock()
+        self._forget()
+
+    @property
+    def _limited(self) -> bool:
+        return bool(self._tracer.tables.max_bounces < np.iinfo(np.int32).max)
+
+    def survey(self, threads: int) -> float:
+        """The share of what probes see that the first stage will know where nothing is in the way; no path is traced for it."""
+        never = np.zeros(1, np.uint8)
+        points, met = find_points(self._tracer, self._positions, (0, self._each), self._seed, threads=threads, cancelled=never)
+        grid = self._grid(0)
+        code = codes(grid, points) >> np.uint64(3 * (int(grid[4]) - 1))
+        _, cell, count = np.unique(code, return_inverse=True, return_counts=True)
+        self.cached = float((count[cell] >= HALVES * FEWEST).sum() / met) if met else 0.0
+        return self.cached
+
+    def tracer(self, samples: int, *, threads: int, cancelled: Flag) -> Tracer:
+        """What a pass that ends at so many samples traces with.
+
+        Raises
+        ------
+        Cancelled
+            What is known stays as it was.
+        """
+        stage = _stage(samples)
+        with self._lock:
+            if stage < self._stage:
+                self._forget()
+            while self._stage < stage:
+                self._learn(self._stage + 1, threads, cancelled)
+            return self._cached
+
+    def bytes(self, samples: int) -> int:
+        """What is held at most, once so many samples have been taken."""
+        points = len(self._positions) * SCRAMBLES * self._rounds(_stage(samples))
+        return points * (_POINT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
+
+    def blank(self) -> Tracer:
+        """The tracer with a cache that knows nothing: for kernels that are to be compiled, and who starts to learn."""
+        return _with(self._tracer, empty_cache(SCRAMBLES))
+
+    def compile(self) -> None:
+        """Compile, or fetch from the cache on disk, the kernels that learn: from no point."""
+        never, points = np.zeros(1, np.uint8), Points.none()
+        find_points(self._tracer, self._positions, (0, 0), self._seed, threads=1, cancelled=never)
+        gather_light(self.blank(), points, (0, 1), threads=1, cancelled=never)
+        average(self._tracer, points, 1, self._grid(0), threads=1)
+
+    def _forget(self) -> None:
+        self._stage, self._points, self._cached = -1, Points.none(), self.blank()
+
+    def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:
+        rounds, paths = self._rounds(stage), self._paths(stage)
+        before = (self._rounds(stage - 1), self._paths(stage - 1)) if stage else (0, 0)
+        old = replace(self._points, light=self._points.light.copy())
+        tracer = self._teacher()
+        if len(old) and paths > before[1]:
+            gather_light(tracer, old, (before[1], paths), threads=threads, cancelled=cancelled)
+        steps: Sequence[int] = (before[0], rounds)
+        if stage == 0 and not self._limited and rounds > 3:
+            steps = (0, rounds // 4, rounds)
+        grid, points = self._grid(stage), old
+        for step, (begin, end) in enumerate(pairwise(steps)):
+            if step:
+                tracer = _with(tracer, average(tracer, points, paths, grid, threads=threads))
+            new, _ = find_points(self._tracer, self._positions, (begin, end), self._seed, threads=threads, cancelled=cancelled)
+            gather_light(tracer, new, (0, paths), threads=threads, cancelled=cancelled)
+            points = points + new
+        cache = average(self._tracer, points, paths, grid, threads=threads)
+        self._stage, self._points, self._cached = stage, points, _with(self._tracer, cache)
+
+    def _teacher(self) -> Tracer:
+        """What paths from points are traced with: a cache ends them, unless it knows of one bounce too many."""
+        if not self._limited:
+            return self._cached
+        blank = self.blank()
+        return replace(blank, tables=blank.tables._replace(max_bounces=np.int64(blank.tables.max_bounces - 1)))
+
+    def _rounds(self, stage: int) -> int:
+        """Points of each probe and scramble; the paths from each make up for the stages in which they do not grow."""
+        most = max(_MOST_POINTS // (len(self._positions) * SCRAMBLES), self._each)
+        return min(self._each << ((stage + 1) // 2), most)
+
+    def _paths(self, stage: int) -> int:
+        return max((self._each * _PATHS << stage) // self._rounds(stage), 1)
+
+    def _grid(self, stage: int) -> F64:
+        smallest = self._smallest * _SMALLEST / 2 ** (stage // 2)
+        sizes = _SIZES + math.ceil(math.log2(self._largest / self._smallest)) + stage // 2
+        middle = (self._positions.min(0) + self._positions.max(0)) / 2
+        # Not a multiple of anything, lest walls lie on the edges of cells.
+        corner = middle - (AXIS_CELLS / 2 + 0.37) * smallest
+        return np.array([*corner, smallest, min(sizes, _MOST_SIZES), not self._limited], np.float64)
+
+
+def _stage(samples: int) -> int:
+    return max(samples // FIRST_SAMPLES, 1).bit_length() - 1
+
+
+def surface_light(spec: Spec, tracer: Tracer, positions: F64, units: F64, texels: int, *, threads: int) -> SurfaceLight | None:
+    """The cache that a spec asks for; None where every path shall be traced to its end.
+
+    ``auto`` takes the cache where paths bounce, many probes share what they see, and half of that is matt surfaces that are seen often
+    enough. Parameters are :class:`SurfaceLight`'s.
+    """
+    bounces = tracer.tables.max_bounces
+    if spec.integrator == "path" or bounces < 2 or (spec.integrator == "auto" and len(positions) < FEWEST_PROBES):
+        return None
+    light = SurfaceLight(tracer, positions, units, texels, spec.seed)
+    enough = light.survey(threads) >= _COVERED
+    return light if enough or spec.integrator == "cache" else None
+
+
+def _with(tracer: Tracer, cache: LightCache) -> Tracer:
+    return replace(tracer, tables=tracer.tables._replace(cache=cache))
