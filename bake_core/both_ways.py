@@ -20,7 +20,6 @@ from bake_core.prepared import Prepared, prepare
 from bake_core.report import Run
 from bake_core.scene import Scene
 from bake_core.spec import OUTPUTS, Spec
-from bake_core.surface_light import surface_light
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,8 @@ class BothWays:
 
 def everything(scene: Scene, spec: Spec, find: Find = no_images, *, threads: int = 1) -> Prepared:
     """A bake that leaves out no output, no probe that stands outside solids, no environment, nor code for textures, holes and gloss."""
-    prepared = prepare(scene, spec.model_copy(update={"outputs": OUTPUTS, "receivers": "everywhere"}), find)
-    whole = prepared.whole.general(scene)
-    light = surface_light(spec, whole, prepared.positions, prepared.units, prepared.selection.capture**2, threads=threads)
-    return replace(prepared, tracer=whole, whole=whole, light=light)
+    prepared = prepare(scene, spec.model_copy(update={"outputs": OUTPUTS, "receivers": "everywhere"}), find, threads=threads)
+    return prepared.traced_with(prepared.whole.general(scene))
 
 
 def measure(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> BothWays:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -68,6 +68,11 @@ class Prepared:
     @property
     def probe_count(self) -> int:
         return len(self.positions)
+
+    def traced_with(self, tracer: Tracer) -> Prepared:
+        """The same bake by other tables of the same scene."""
+        light = self.light and self.light.traced_with(tracer)
+        return replace(self, tracer=tracer, whole=tracer, light=light)
 
     @property
     def left_out(self) -> tuple[LeftOut, ...]:

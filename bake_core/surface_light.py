@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -104,6 +105,13 @@ class SurfaceLight:
             while self._stage < stage:
                 self._learn(self._stage + 1, threads, cancelled)
             return self._cached
+
+    def traced_with(self, tracer: Tracer) -> SurfaceLight:
+        """The same by other tables of the same scene; nothing learnt yet."""
+        made = copy(self)
+        made._tracer, made._lock = tracer, threading.Lock()
+        made._forget()
+        return made
 
     def bytes(self, samples: int) -> int:
         """What is held at most, once so many samples have been taken."""

@@ -6,10 +6,15 @@ import argparse
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.cli.bake import positive
+
+if TYPE_CHECKING:
+    from bake_core.scene import Scene
+    from bake_core.spec import Spec
 
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -20,7 +25,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Bake and verify a few probes; prints where the compiled kernels lie."""
+    """Verify a small bake, and compile what other scenes will ask for; prints where the compiled kernels lie."""
     import numba
 
     from bake_core import verification
@@ -33,7 +38,6 @@ def run(args: argparse.Namespace) -> int:
 
     began = time.monotonic()
     glb, spec = cornell()
-    # A kernel's machine code hangs on the types of its arguments and never on a scene: so one small bake of everything compiles all.
     few: dict[str, Any] = {**spec["volumes"][0], "counts": [2, 2, 2]}
     whole = parse_spec({**spec, "volumes": [few], "outputs": list(OUTPUTS), "stop": {"target_error": None, "max_samples": 16}})
     with tempfile.TemporaryDirectory(prefix="octobake-warmup-") as name:
@@ -47,5 +51,28 @@ def run(args: argparse.Namespace) -> int:
         except MachineError as e:
             # Where nothing can be verified, its kernels are not wanted.
             without = f" (without those of verification: {e})"
+        _compile_the_others(scene, whole, folder)
     print(f"kernels are ready in {numba.config.CACHE_DIR} after {time.monotonic() - began:.1f} s{without}")
     return 0
+
+
+def _compile_the_others(scene: Scene, spec: Spec, folder: Path) -> None:
+    """For each kind of scene: a kernel's machine code hangs on whether there are gloss, textures, an image for a sky, and a light cache."""
+    import numpy as np
+
+    from bake_core.bake import compile_kernels
+    from bake_core.environment import beside
+    from bake_core.ggx_albedo import albedo_table
+    from bake_core.images import write_exr
+    from bake_core.prepared import prepare
+    from bake_core.spec import ConstantEnvironment, EquirectEnvironment
+
+    write_exr(folder / "sky.exr", np.ones((2, 4, 3), np.float32), ("R", "G", "B"))
+    for environment in (ConstantEnvironment(), EquirectEnvironment(kind="equirect", image="sky.exr")):
+        for integrator in ("path", "cache"):
+            changed = spec.model_copy(update={"environment": environment, "integrator": integrator})
+            prepared = prepare(scene, changed, beside(folder))
+            whole = prepared.whole
+            glossy = replace(whole, tables=whole.tables._replace(gloss=albedo_table()))
+            for tracer in (whole, glossy, whole.general(scene)):
+                compile_kernels(prepared.traced_with(tracer), audited=True)
