@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from dataclasses import fields
 
 import numpy as np
 from numba import uint64
@@ -64,13 +64,15 @@ def _place_middle(t, ray, ray_bits, height, s, middle):  # type: ignore[no-untyp
 
 
 @entry_kernel
-def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, sums, key, known, middle, out):  # type: ignore[no-untyped-def]
+def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, answered, sums, key, known, middle, out):  # type: ignore[no-untyped-def]
     """Average the points of each cell that see its middle, which is above the first of them.
 
     Parameters
     ----------
     begin, end : (c,) int64
         Where each cell's points begin and end.
+    answered : (n,) bool, False
+        Becomes true for points in the averages.
     sums : (SCRAMBLES, 4) float64
         To work in.
     """
@@ -84,12 +86,14 @@ def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, 
         if not known[c]:
             continue
         sums[:] = 0.0
+        fewest = math.inf
         for i in range(begin[c], end[c]):
             s = place[i]
             if sees_middle(t, ray, ray_bits, (s[0], s[1], s[2]), (s[3], s[4], s[5]), s[9], middle[c]):
                 for channel in range(3):
                     sums[scramble[i], channel] += light[i, channel]
                 sums[scramble[i], 3] += 1
+                answered[i] = True
         for half in range(HALVES):
             own = half * SCRAMBLES_PER_HALF
             red = green = blue = count = 0.0
@@ -98,7 +102,7 @@ def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, 
                 green += sums[g, 1]
                 blue += sums[g, 2]
                 count += sums[g, 3]
-            known[c] = known[c] and count >= FEWEST
+            fewest = min(fewest, count)
             if count >= FEWEST:
                 red, green, blue = red / count, green / count, blue / count
                 # A scramble's own mean would need points of its own in every cell. It differs from its half's mean as the sums do, to first
@@ -109,6 +113,9 @@ def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, 
                     out[c, g, 0] = red + scale * (sums[g, 0] - sums[g, 3] * red)
                     out[c, g, 1] = green + scale * (sums[g, 1] - sums[g, 3] * green)
                     out[c, g, 2] = blue + scale * (sums[g, 2] - sums[g, 3] * blue)
+        known[c] = fewest >= FEWEST
+        if not known[c]:
+            answered[begin[c] : end[c]] = False
 
 
 @entry_kernel
@@ -132,7 +139,7 @@ def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: i
     ----------
     paths : int
         That each point's light is a sum over.
-    grid : (6,) float64
+    grid : (7,) float64
         As :class:`bake_core.light_cache.LightCache` has it.
     """
     tables = tracer.tables._replace(cache=None)
@@ -140,8 +147,13 @@ def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: i
     # Stable: points of a cell stay in the order in which they were found.
     order = np.argsort(code, kind="stable")[: int((code != _ALL_ONES).sum())]
     code = code[order]
-    sorted_points = (points.place[order], points.way[order], points.scramble[order], (points.light[order] / paths).astype(np.float32))
-    levels = [_level(tables, code, sorted_points, grid, level, threads) for level in range(int(grid[4]))]
+    points = Points(*(getattr(points, f.name)[order] for f in fields(points)))
+    levels = []
+    for level in range(int(grid[4])):
+        cells, answered = _level(tables, code, points, paths, grid, level, threads)
+        levels.append(cells)
+        # Who asks a larger cell has not been answered by a smaller one, as who stands in a crevice may not; so no more are its points.
+        code, points = code[~answered], Points(*(getattr(points, f.name)[~answered] for f in fields(points)))
     keys, middle, light = (np.concatenate(parts) for parts in zip(*levels, strict=True))
     table = np.full((1 << max(2 * len(keys), 16).bit_length(), 2), NONE)
     _table_kernel(keys, table)
@@ -149,20 +161,21 @@ def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: i
 
 
 def _level(
-    tables: Tables, code: U64, points: tuple[NDArray[Any], ...], grid: F64, level: int, threads: int
-) -> tuple[U64, F64, NDArray[np.float32]]:
-    """Keys, middles and light of the cells of one size that know any."""
+    tables: Tables, code: U64, points: Points, paths: int, grid: F64, level: int, threads: int
+) -> tuple[tuple[U64, F64, NDArray[np.float32]], NDArray[np.bool_]]:
+    """Keys, middles and light of the cells of one size that know any; and whose points they answer."""
     edges = np.flatnonzero(np.diff(code >> np.uint64(3 * level), prepend=_ALL_ONES, append=_ALL_ONES))
     enough = np.flatnonzero(np.diff(edges) >= HALVES * FEWEST)
     begin, end, n = edges[enough], edges[enough + 1], len(enough)
     key, known, middle = np.empty(n, np.uint64), np.empty(n, np.bool_), np.empty((n, 3))
-    light = np.empty((n, SCRAMBLES, 3), np.float32)
+    light, answered = np.empty((n, SCRAMBLES, 3), np.float32), np.zeros(len(points), np.bool_)
+    radiance = (points.light / paths).astype(np.float32)
 
     def some(first: int) -> None:
         part, sums = slice(first, first + _CHUNK), np.zeros((SCRAMBLES, 4))
-        cells = (begin[part], end[part], *points, sums, key[part], known[part], middle[part], light[part])
-        _cells_kernel(tables, new_rayhit(), grid, level, *cells)
+        asked = (begin[part], end[part], points.place, points.way, points.scramble, radiance, answered, sums)
+        _cells_kernel(tables, new_rayhit(), grid, level, *asked, key[part], known[part], middle[part], light[part])
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(some, range(0, max(n, 1), _CHUNK)))
-    return key[known], middle[known], light[known]
+    return (key[known], middle[known], light[known]), answered

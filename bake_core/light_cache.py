@@ -36,9 +36,9 @@ class LightCache(NamedTuple):
 
     Attributes
     ----------
-    grid : (6,) float64
-        The grid's lower corner, local frame; the size of the smallest cells, metres; how many sizes there are; and whether the cache
-        answers at any vertex (1), or only at a path's first (0): where bounces are limited, what is known of light that bounces so often
+    grid : (7,) float64
+        The grid's lower corner, local frame; the size of the smallest cells, metres; how many sizes there are; and the first and the last
+        vertex of a path that it answers at: where bounces are limited that is only one, for what is known of light that bounces so often
         is not what is asked for after another bounce.
     table : (2^k, 2) uint64
         A hash table with linear probing (Knuth 1998, "The Art of Computer Programming" 3, section 6.4): :func:`cell_key`, or NONE where
@@ -57,7 +57,7 @@ class LightCache(NamedTuple):
 
 def empty_cache(scrambles: int) -> LightCache:
     """A cache that knows nothing."""
-    return LightCache(np.zeros(6), np.full((1, 2), NONE), np.zeros((0, 3)), np.zeros((0, scrambles, 3), np.float32))
+    return LightCache(np.zeros(7), np.full((1, 2), NONE), np.zeros((0, 3)), np.zeros((0, scrambles, 3), np.float32))
 
 
 @kernel
@@ -114,7 +114,7 @@ def sees_middle(t, ray, ray_bits, p, n, epsilon, middle):  # type: ignore[no-unt
 
 def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon):  # type: ignore[no-untyped-def]
     c = t.cache
-    if depth == 1 or c.grid[5] > 0:
+    if c.grid[5] <= depth <= c.grid[6]:
         i, j, k, within = cell_of(c.grid, p)
         way = facing(n[3], n[4], n[5])
         for level in range(int(c.grid[4]) if within else 0):

@@ -159,6 +159,15 @@ def chosen_in_words(parameters: dict[str, float], chosen: dict[str, Any]) -> str
     return f"bias {bias:g}, floor {floor:g}, fade {fade:g}: {measured}" + ("" if here == default else f", {default} by default")
 
 
+def integrator_in_words(manifest: dict[str, Any]) -> str:
+    """Where a manifest's paths ended."""
+    # Bundles of before had no cache.
+    cached = manifest["sampling"].get("cached")
+    return (
+        "traced to their ends" if cached is None else f"ended in the light cache, which knew {percent(cached)} of what probes see at first"
+    )
+
+
 def places_in_words(probes: dict[str, Any]) -> str:
     """What a manifest says of where a volume's probes stand, and what that was decided by."""
     tried = probes["tried"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -67,7 +66,7 @@ class SurfaceLight:
     """
 
     def __init__(self, tracer: Tracer, positions: F64, units: F64, texels: int, seed: int) -> None:
-        self.cached = 0.0
+        self.cached, self._made = 0.0, (positions, units, texels, seed)
         self._tracer, self._seed = tracer, seed ^ _SEED
         some = np.random.default_rng(self._seed).permutation(len(positions))[:_MOST_PROBES]
         self._positions = np.ascontiguousarray(positions[np.sort(some)])
@@ -108,10 +107,15 @@ class SurfaceLight:
 
     def traced_with(self, tracer: Tracer) -> SurfaceLight:
         """The same by other tables of the same scene; nothing learnt yet."""
-        made = copy(self)
-        made._tracer, made._lock = tracer, threading.Lock()
-        made._forget()
-        return made
+        return SurfaceLight(tracer, *self._made)._surveyed(self.cached)
+
+    def seeded(self, seed: int) -> SurfaceLight:
+        """The same by other random numbers; nothing learnt yet."""
+        return SurfaceLight(self._tracer, *self._made[:-1], seed)._surveyed(self.cached)
+
+    def _surveyed(self, cached: float) -> SurfaceLight:
+        self.cached = cached
+        return self
 
     def bytes(self, samples: int) -> int:
         """What is held at most, once so many samples have been taken."""
@@ -145,7 +149,7 @@ class SurfaceLight:
         grid, points = self._grid(stage), old
         for step, (begin, end) in enumerate(pairwise(steps)):
             if step:
-                tracer = _with(tracer, average(tracer, points, paths, grid, threads=threads))
+                tracer = _teaching(_with(tracer, average(tracer, points, paths, grid, threads=threads)))
             new, _ = find_points(self._tracer, self._positions, (begin, end), self._seed, threads=threads, cancelled=cancelled)
             gather_light(tracer, new, (0, paths), threads=threads, cancelled=cancelled)
             points = points + new
@@ -155,7 +159,7 @@ class SurfaceLight:
     def _teacher(self) -> Tracer:
         """What paths from points are traced with: a cache ends them, unless it knows of one bounce too many."""
         if not self._limited:
-            return self._cached
+            return _teaching(self._cached)
         blank = self.blank()
         return replace(blank, tables=blank.tables._replace(max_bounces=np.int64(blank.tables.max_bounces - 1)))
 
@@ -173,7 +177,7 @@ class SurfaceLight:
         middle = (self._positions.min(0) + self._positions.max(0)) / 2
         # Not a multiple of anything, lest walls lie on the edges of cells.
         corner = middle - (AXIS_CELLS / 2 + 0.37) * smallest
-        return np.array([*corner, smallest, min(sizes, _MOST_SIZES), not self._limited], np.float64)
+        return np.array([*corner, smallest, min(sizes, _MOST_SIZES), 1, 1 if self._limited else np.inf], np.float64)
 
 
 def _stage(samples: int) -> int:
@@ -192,6 +196,13 @@ def surface_light(spec: Spec, tracer: Tracer, positions: F64, units: F64, texels
     light = SurfaceLight(tracer, positions, units, texels, spec.seed)
     enough = light.survey(threads) >= _COVERED
     return light if enough or spec.integrator == "cache" else None
+
+
+def _teaching(tracer: Tracer) -> Tracer:
+    """With a cache that answers from the second surface on: what it smooths at the first would add to what it smooths itself."""
+    cache = tracer.tables.cache
+    assert cache is not None
+    return _with(tracer, cache._replace(grid=np.array([*cache.grid[:5], 2, cache.grid[6]])))
 
 
 def _with(tracer: Tracer, cache: LightCache) -> Tracer:

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str) -> list[str]:
     from bake_core.rate import Rate, in_words
-    from bake_core.report import audit_in_words, audit_of, chosen_in_words, percent, places_in_words
+    from bake_core.report import audit_in_words, audit_of, chosen_in_words, integrator_in_words, percent, places_in_words
     from service.cli.plan import left_out_lines
     from service.cli.progress import count
 
@@ -41,6 +41,7 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         f"made by    {manifest['generator']} on {manifest['instruction_set']}",
         f"scene      {manifest['scene']['digest']}, {manifest['scene']['triangles']} triangles",
         f"samples    {manifest['samples']}, stopped by {manifest['stopped']}",
+        f"paths      {integrator_in_words(manifest)}",
         f"error      {percent(error['value'])} (target {percent(error['target'])}), sampling only",
         f"size       {size} bytes",
     ]
