@@ -25,7 +25,7 @@ Flag = NDArray[np.uint8]
 # Paths that the cache learns from, over those that read it: where squared error times seconds is least, which is a flat valley.
 _SHARE = 0.5
 # From one point in the first stage: its ray from the probe costs little beside them.
-_PATHS = 32
+_PATHS = 16
 # Probes that points are looked for from, and points in the end: what a large bake holds of them, some 600 MB.
 _MOST_PROBES, _MOST_POINTS = 1 << 14, 1 << 21
 # The smallest cells of the first stage, in the smallest spacing of probes; how many sizes there are up to the largest spacing.

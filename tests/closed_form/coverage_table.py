@@ -121,7 +121,7 @@ def _courtyard(folder: Path) -> Prepared:
     """A room whose only light comes in through the roof that it lacks: an even sky."""
     glb, _ = cornell()
     environment = {"kind": "constant", "radiance": [1.0, 0.9, 0.8]}
-    return _example(folder, glb, {"volumes": [GRID], "environment": environment, "max_bounces": 3})
+    return _example(folder, glb, {"volumes": [GRID], "environment": environment, "max_bounces": 3, "integrator": "path"})
 
 
 # Name, scene, target.
