@@ -71,7 +71,9 @@ class SurfaceLight:
         some = np.random.default_rng(self._seed).permutation(len(positions))[:_MOST_PROBES]
         self._positions = np.ascontiguousarray(positions[np.sort(some)])
         self._smallest, self._largest = float(units.min()), float(units.max())
-        self._each = max(round(_SHARE * texels * FIRST_SAMPLES / SCRAMBLES / _PATHS), 1)
+        # Of each probe and scramble.
+        self._first_paths = max(round(_SHARE * texels * FIRST_SAMPLES / SCRAMBLES), 1)
+        self._most_rounds = max(_MOST_POINTS // max(len(self._positions) * SCRAMBLES, 1), 1)
         self._lock = threading.Lock()
         self._forget()
 
@@ -82,7 +84,7 @@ class SurfaceLight:
     def survey(self, threads: int) -> float:
         """The share of what probes see that the first stage will know where nothing is in the way; no path is traced for it."""
         never = np.zeros(1, np.uint8)
-        points, met = find_points(self._tracer, self._positions, (0, self._each), self._seed, threads=threads, cancelled=never)
+        points, met = find_points(self._tracer, self._positions, (0, self._rounds(0)), self._seed, threads=threads, cancelled=never)
         grid = self._grid(0)
         code = codes(grid, points) >> np.uint64(3 * (int(grid[4]) - 1))
         _, cell, count = np.unique(code, return_inverse=True, return_counts=True)
@@ -165,11 +167,10 @@ class SurfaceLight:
 
     def _rounds(self, stage: int) -> int:
         """Points of each probe and scramble; the paths from each make up for the stages in which they do not grow."""
-        most = max(_MOST_POINTS // (len(self._positions) * SCRAMBLES), self._each)
-        return min(self._each << ((stage + 1) // 2), most)
+        return min(max(self._first_paths // _PATHS, 1) << ((stage + 1) // 2), self._most_rounds)
 
     def _paths(self, stage: int) -> int:
-        return max((self._each * _PATHS << stage) // self._rounds(stage), 1)
+        return max((self._first_paths << stage) // self._rounds(stage), 1)
 
     def _grid(self, stage: int) -> F64:
         smallest = self._smallest * _SMALLEST / 2 ** (stage // 2)

@@ -179,6 +179,18 @@ def test_who_is_stopped_while_it_learns_begins_again() -> None:
     assert np.array_equal(traced(p, (16,)).irradiance, traced(afresh, (16,)).irradiance)
 
 
+def test_a_large_bake_holds_no_more_points_than_it_may() -> None:
+    """Many probes of many texels: more paths from each point instead, and the same number of them in all."""
+    light = prepared(cornell(), integrator="cache").light
+    assert light is not None
+    tracer = light.blank()
+    for probes, texels in ((512, 256), (512, 64 * 64), (20_000, 64 * 64), (1 << 20, 256)):
+        large = SurfaceLight(tracer, np.zeros((probes, 3)), np.ones(probes), texels, 0)
+        assert large.bytes(1 << 20) < 1.2e9
+        for stage in range(8):
+            assert large._rounds(stage) * large._paths(stage) == pytest.approx(texels / 2 * 2**stage, rel=0.5)
+
+
 # --- when it is used ---------------------------------------------------------------------------------------------------------------
 
 
