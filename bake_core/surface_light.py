@@ -75,7 +75,7 @@ class SurfaceLight:
         self._first_paths = max(round(_SHARE * texels * FIRST_SAMPLES / SCRAMBLES), 1)
         self._most_rounds = max(_MOST_POINTS // max(len(self._positions) * SCRAMBLES, 1), 1)
         self._lock = threading.Lock()
-        self._forget()
+        self.forget()
 
     @property
     def _limited(self) -> bool:
@@ -102,7 +102,7 @@ class SurfaceLight:
         stage = _stage(samples)
         with self._lock:
             if stage < self._stage:
-                self._forget()
+                self.forget()
             while self._stage < stage:
                 self._learn(self._stage + 1, threads, cancelled)
             return self._cached
@@ -135,7 +135,8 @@ class SurfaceLight:
         gather_light(self.blank(), points, (0, 1), threads=1, cancelled=never)
         average(self._tracer, points, 1, self._grid(0), threads=1)
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """Hold nothing any more; whoever asks again has it learnt anew."""
         self._stage, self._points, self._cached = -1, Points.none(), self.blank()
 
     def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:

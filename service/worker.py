@@ -158,8 +158,11 @@ def finish(work: Work, state: str, run: Run) -> dict[str, Any]:
     with _task(work) as task, tempfile.TemporaryDirectory(prefix="octobake-") as folder:
         blobs = _blobs(work.store)
         out = Path(folder) / "bundle.zip"
-        sums = _state(work, state)
-        bake.finish(_prepared(work), sums, run, out, cancelled=task.flag)
+        sums, prepared = _state(work, state), _prepared(work)
+        bake.finish(prepared, sums, run, out, cancelled=task.flag)
+        if prepared.light is not None:
+            # The scene is kept for who bakes it again; what was learnt of its light is this bake's alone.
+            prepared.light.forget()
         with zipfile.ZipFile(out) as bundle:
             report = Path(bundle.extract("report.json", folder))
         return {"bundle": blobs.put_blob(out), "report": blobs.put_blob(report), "preview": blobs.put_blob(_preview(sums, folder))}
