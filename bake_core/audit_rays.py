@@ -17,7 +17,7 @@ from bake_core.embree import new_rayhit
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.filtering import VISIBILITY_SHARPNESS
-from bake_core.kernels import either, entry_kernel, kernel
+from bake_core.kernels import CANCELLED, DONE, either, entry_kernel, kernel
 from bake_core.next_event import sample_emitter
 from bake_core.sampling import basis, mix64, reverse_bits, sobol_pair
 from bake_core.surfaces import INFINITE, blocked, find_surface, surface
@@ -26,7 +26,6 @@ from bake_core.transport import trace_path
 
 F64 = NDArray[np.float64]
 
-_CANCELLED, _DONE = 1, 0
 _HALVES = 2
 _UNIFORM_PDF = 1 / (4 * math.pi)
 
@@ -70,7 +69,7 @@ def sphere_irradiance(
         return status
 
     with ThreadPoolExecutor(threads) as pool:
-        if any(status == _CANCELLED for status in pool.map(trace, range(len(positions)))):
+        if any(status == CANCELLED for status in pool.map(trace, range(len(positions)))):
             raise Cancelled
     return out
 
@@ -107,7 +106,7 @@ def _sphere_kernel(t, ray, positions, normals, first, samples, seed, cancelled, 
             gain = 1.0 / samples
             for sample in range(samples):
                 if cancelled[0]:
-                    return _CANCELLED
+                    return CANCELLED
                 index = uint32(sample)
                 reversed_index = reverse_bits(index)
                 u, v = sobol_pair(reversed_index, key)
@@ -134,7 +133,7 @@ def _sphere_kernel(t, ray, positions, normals, first, samples, seed, cancelled, 
                 if has_sky(t):
                     a, b = sobol_pair(reversed_index, light_key + uint64(2))
                     _add_sky_light(t, ray, ray_bits, x, y, z, a, b, gain, normals, into)
-    return _DONE
+    return DONE
 
 
 def lobe_moments(
@@ -161,7 +160,7 @@ def lobe_moments(
     Cancelled
     """
     out = np.zeros((_HALVES, len(positions), 2))
-    if _lobe_kernel(tracer.tables, new_rayhit(), positions, directions, limits, samples, np.uint64(seed), cancelled, out) == _CANCELLED:
+    if _lobe_kernel(tracer.tables, new_rayhit(), positions, directions, limits, samples, np.uint64(seed), cancelled, out) == CANCELLED:
         raise Cancelled
     return out
 
@@ -172,7 +171,7 @@ def _lobe_kernel(t, ray, positions, directions, limits, samples, seed, cancelled
     ray_bits = ray.view(np.uint32)
     for i in range(positions.shape[0]):
         if cancelled[0]:
-            return _CANCELLED
+            return CANCELLED
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         nx, ny, nz = directions[i, 0], directions[i, 1], directions[i, 2]
         tx, ty, tz, bx, by, bz = basis(np.float32(nx), np.float32(ny), np.float32(nz))
@@ -193,4 +192,4 @@ def _lobe_kernel(t, ray, positions, directions, limits, samples, seed, cancelled
                 mean += distance
                 square += distance * distance
             out[half, i, 0], out[half, i, 1] = mean / samples, square / samples
-    return _DONE
+    return DONE

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 
 import numpy as np
 from numba import uint64
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.cache_points import Points
-from bake_core.embree import new_rayhit
+from bake_core.embree import new_rayhit, rays_traced
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.light_cache import AXIS_BITS, NONE, LightCache, cell_key, cell_of, find, sees_middle
 from bake_core.tracer import Tables, Tracer
@@ -27,7 +26,6 @@ _HEIGHT = 0.25
 _TRIES = 3
 # Cells a thread averages at once.
 _CHUNK = 1024
-_ALL_ONES = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 @kernel
@@ -41,11 +39,11 @@ def _spread_bits(x):  # type: ignore[no-untyped-def]
 
 @entry_kernel
 def _codes_kernel(grid, place, way, code):  # type: ignore[no-untyped-def]
-    """Numbers by which the points of one cell stand together, whatever its size; all ones beyond the grid."""
+    """Numbers by which the points of one cell stand together, whatever its size; NONE beyond the grid."""
     for i in range(code.shape[0]):
         x, y, z, within = cell_of(grid, (place[i, 0], place[i, 1], place[i, 2]))
         morton = _spread_bits(x) | _spread_bits(y) << uint64(1) | _spread_bits(z) << uint64(2)
-        code[i] = uint64(way[i]) << uint64(3 * AXIS_BITS) | morton if within else _ALL_ONES
+        code[i] = uint64(way[i]) << uint64(3 * AXIS_BITS) | morton if within else NONE
 
 
 @kernel
@@ -132,8 +130,8 @@ def codes(grid: F64, points: Points) -> U64:
     return code
 
 
-def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: int) -> LightCache:
-    """A cache of what points know; the same bits for any number of threads.
+def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: int) -> tuple[LightCache, int]:
+    """A cache of what points know, and the rays that it took to ask who sees whom; the same bits for any number of threads.
 
     Parameters
     ----------
@@ -145,37 +143,39 @@ def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: i
     tables = tracer.tables._replace(cache=None)
     code = codes(grid, points)
     # Stable: points of a cell stay in the order in which they were found.
-    order = np.argsort(code, kind="stable")[: int((code != _ALL_ONES).sum())]
+    order = np.argsort(code, kind="stable")[: int((code != NONE).sum())]
     code = code[order]
-    points = Points(*(getattr(points, f.name)[order] for f in fields(points)))
-    levels = []
+    points, levels, rays = points[order], [], 0
     for level in range(int(grid[4])):
-        cells, answered = _level(tables, code, points, paths, grid, level, threads)
+        cells, answered, traced = _level(tables, code, points, paths, grid, level, threads)
+        rays += traced
         levels.append(cells)
         # Who asks a larger cell has not been answered by a smaller one, as who stands in a crevice may not; so no more are its points.
-        code, points = code[~answered], Points(*(getattr(points, f.name)[~answered] for f in fields(points)))
+        code, points = code[~answered], points[~answered]
     keys, middle, light = (np.concatenate(parts) for parts in zip(*levels, strict=True))
     table = np.full((1 << max(2 * len(keys), 16).bit_length(), 2), NONE)
     _table_kernel(keys, table)
-    return LightCache(grid, table, middle, light)
+    return LightCache(grid, table, middle, light), rays
 
 
 def _level(
     tables: Tables, code: U64, points: Points, paths: int, grid: F64, level: int, threads: int
-) -> tuple[tuple[U64, F64, NDArray[np.float32]], NDArray[np.bool_]]:
-    """Keys, middles and light of the cells of one size that know any; and whose points they answer."""
-    edges = np.flatnonzero(np.diff(code >> np.uint64(3 * level), prepend=_ALL_ONES, append=_ALL_ONES))
+) -> tuple[tuple[U64, F64, NDArray[np.float32]], NDArray[np.bool_], int]:
+    """Keys, middles and light of the cells of one size that know any; whose points they answer; and rays."""
+    edges = np.flatnonzero(np.diff(code >> np.uint64(3 * level), prepend=NONE, append=NONE))
     enough = np.flatnonzero(np.diff(edges) >= HALVES * FEWEST)
     begin, end, n = edges[enough], edges[enough + 1], len(enough)
     key, known, middle = np.empty(n, np.uint64), np.empty(n, np.bool_), np.empty((n, 3))
     light, answered = np.empty((n, SCRAMBLES, 3), np.float32), np.zeros(len(points), np.bool_)
     radiance = (points.light / paths).astype(np.float32)
 
-    def some(first: int) -> None:
+    def some(first: int) -> int:
+        ray = new_rayhit()
         part, sums = slice(first, first + _CHUNK), np.zeros((SCRAMBLES, 4))
         asked = (begin[part], end[part], points.place, points.way, points.scramble, radiance, answered, sums)
-        _cells_kernel(tables, new_rayhit(), grid, level, *asked, key[part], known[part], middle[part], light[part])
+        _cells_kernel(tables, ray, grid, level, *asked, key[part], known[part], middle[part], light[part])
+        return rays_traced(ray)
 
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(some, range(0, max(n, 1), _CHUNK)))
-    return (key[known], middle[known], light[known]), answered
+        rays = sum(pool.map(some, range(0, max(n, 1), _CHUNK)))
+    return (key[known], middle[known], light[known]), answered, rays

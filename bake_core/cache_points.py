@@ -11,31 +11,31 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.allocation import SCRAMBLES
-from bake_core.embree import new_rayhit
+from bake_core.embree import new_rayhit, rays_traced
 from bake_core.errors import Cancelled
-from bake_core.kernels import entry_kernel
+from bake_core.kernels import CANCELLED, DONE, entry_kernel
 from bake_core.light_cache import facing
-from bake_core.materials import INV_PI, is_glossy, lambert_cosine, sample_lambert
+from bake_core.materials import is_glossy
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.surfaces import find_surface, surface
-from bake_core.textures import reflectance, scattered_spread
+from bake_core.textures import reflectance
 from bake_core.tracer import Tracer
-from bake_core.transport import trace_path
+from bake_core.transport import trace_by_cosine
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Flag = NDArray[np.uint8]
 
 # Rays a thread takes at once: tens of milliseconds' work.
 _CHUNK = 8192
 _CHUNK_PATHS = 1 << 15
-_CANCELLED, _DONE = 1, 0
 # Where a ray that found no point has ended: nowhere, or at a surface that is of no use.
 _MISSED, _UNSUITED = 255, 254
 
@@ -70,6 +70,10 @@ class Points:
     def __add__(self, more: Points) -> Points:
         return Points(*(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)))
 
+    def __getitem__(self, which: NDArray[Any]) -> Points:
+        """Some of them, in another order where an order is given."""
+        return Points(*(getattr(self, f.name)[which] for f in fields(self)))
+
     @classmethod
     def none(cls) -> Self:
         small = np.zeros(0, np.uint8)
@@ -82,7 +86,7 @@ def _points_kernel(t, ray, positions, first, first_round, rounds, seed, cancelle
     ray_bits = ray.view(np.uint32)
     for i in range(way.shape[0]):
         if cancelled[0]:
-            return _CANCELLED
+            return CANCELLED
         number = first + i
         probe = number // (SCRAMBLES * rounds)
         scramble = number // rounds % SCRAMBLES
@@ -109,7 +113,7 @@ def _points_kernel(t, ray, positions, first, first_round, rounds, seed, cancelle
         for axis in range(6):
             place[i, 3 + axis] = n[axis]
         place[i, 9] = epsilon
-    return _DONE
+    return DONE
 
 
 @entry_kernel
@@ -118,31 +122,31 @@ def _gather_kernel(t, ray, place, key, scramble, first_path, paths, cancelled, l
     ray_bits = ray.view(np.uint32)
     for i in range(place.shape[0]):
         if cancelled[0]:
-            return _CANCELLED
+            return CANCELLED
         s = place[i]
-        n, epsilon = (s[3], s[4], s[5], s[6], s[7], s[8]), s[9]
-        ox, oy, oz = s[0] + epsilon * n[0], s[1] + epsilon * n[1], s[2] + epsilon * n[2]
+        p, n = (s[0], s[1], s[2]), (s[3], s[4], s[5], s[6], s[7], s[8])
         red = green = blue = 0.0
         for path in range(first_path, first_path + paths):
             index = uint32(path)
-            reversed_index = reverse_bits(index)
-            u, v = sobol_pair(reversed_index, key[i])
-            dx, dy, dz = sample_lambert(u, v, n)
-            pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
-            emitted, direct, indirect, _, light_pdf = trace_path(
-                t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key[i], False, scattered_spread(t, 0.0, pdf), scramble[i]
-            )
-            share = pdf / (pdf + light_pdf) if light_pdf > 0 else 1.0
-            red += share * emitted[0] + direct[0] + indirect[0]
-            green += share * emitted[1] + direct[1] + indirect[1]
-            blue += share * emitted[2] + direct[2] + indirect[2]
+            r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, s[9], reverse_bits(index), index, key[i], True, scramble[i])
+            red += r
+            green += g
+            blue += b
         light[i, 0] += red
         light[i, 1] += green
         light[i, 2] += blue
-    return _DONE
+    return DONE
 
 
-def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: int, *, threads: int, cancelled: Flag) -> tuple[Points, int]:
+class Found(NamedTuple):
+    """What rays from probes have met: points, in the dark as yet; how many rays met any surface at all; and how many there were."""
+
+    points: Points
+    met: int
+    rays: int
+
+
+def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: int, *, threads: int, cancelled: Flag) -> Found:
     """Rays from every probe in all directions, for every scramble; the same bits for any number of threads.
 
     Parameters
@@ -154,10 +158,8 @@ def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: i
 
     Returns
     -------
-    Points
-        Where the rays met a matt surface that reflects anything; in the dark as yet.
-    int
-        How many rays met any surface at all.
+    Found
+        Its points are where the rays met a matt surface that reflects anything.
 
     Raises
     ------
@@ -167,19 +169,19 @@ def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: i
     n = len(positions) * SCRAMBLES * each
     place, way, key = np.zeros((n, 10)), np.empty(n, np.uint8), np.zeros(n, np.uint64)
 
-    def some(first: int) -> int:
+    def some(ray: F32, first: int) -> int:
         part = slice(first, first + _CHUNK)
         wanted = (positions, first, rounds[0], each, np.uint64(seed))
-        return int(_points_kernel(tracer.tables, new_rayhit(), *wanted, cancelled, place[part], way[part], key[part]))
+        return int(_points_kernel(tracer.tables, ray, *wanted, cancelled, place[part], way[part], key[part]))
 
-    _on_threads(some, range(0, max(n, 1), _CHUNK), threads)
+    rays = _on_threads(some, range(0, max(n, 1), _CHUNK), threads)
     suited = way < _UNSUITED
     scramble = (np.arange(n) // each % SCRAMBLES).astype(np.uint8)
     points = Points(place[suited], way[suited], key[suited], scramble[suited], np.zeros((int(suited.sum()), 3)))
-    return points, int((way != _MISSED).sum())
+    return Found(points, int((way != _MISSED).sum()), rays)
 
 
-def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, threads: int, cancelled: Flag) -> None:
+def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, threads: int, cancelled: Flag) -> int:
     """Add what paths bring to every point's light; the same bits for any number of threads.
 
     Parameters
@@ -189,6 +191,11 @@ def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, thre
     paths : (int, int)
         Half-open range of paths from each point.
 
+    Returns
+    -------
+    int
+        Rays that it took.
+
     Raises
     ------
     Cancelled
@@ -196,15 +203,22 @@ def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, thre
     count = paths[1] - paths[0]
     step = max(_CHUNK_PATHS // max(count, 1), 1)
 
-    def some(first: int) -> int:
+    def some(ray: F32, first: int) -> int:
         part = slice(first, first + step)
         asked = (points.place[part], points.key[part], points.scramble[part], paths[0], count)
-        return int(_gather_kernel(tracer.tables, new_rayhit(), *asked, cancelled, points.light[part]))
+        return int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[part]))
 
-    _on_threads(some, range(0, max(len(points), 1), step), threads)
+    return _on_threads(some, range(0, max(len(points), 1), step), threads)
 
 
-def _on_threads(some: Callable[[int], int], firsts: range, threads: int) -> None:
-    with ThreadPoolExecutor(threads) as pool:
-        if _CANCELLED in list(pool.map(some, firsts)):
+def _on_threads(some: Callable[[F32, int], int], firsts: range, threads: int) -> int:
+    """Run a kernel for each of some beginnings; how many rays that took."""
+
+    def run(first: int) -> int:
+        ray = new_rayhit()
+        if some(ray, first) == CANCELLED:
             raise Cancelled
+        return rays_traced(ray)
+
+    with ThreadPoolExecutor(threads) as pool:
+        return sum(pool.map(run, firsts))

@@ -20,7 +20,7 @@ from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.embree import new_rayhit, rays_traced
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
-from bake_core.kernels import either, entry_kernel, kernel
+from bake_core.kernels import CANCELLED, DONE, either, entry_kernel, kernel
 from bake_core.next_event import sample_emitter
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
@@ -40,7 +40,6 @@ BLOCKS = 4
 _TEXELS_PER_LIGHT_SAMPLE = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
-_CANCELLED, _DONE = 1, 0
 
 
 @kernel
@@ -174,7 +173,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
         probe_key = mix64(seed ^ mix64(ids[p]))
         for texel in range(texels * blocks[0] // BLOCKS, texels * blocks[1] // BLOCKS):
             if cancelled[0]:
-                return _CANCELLED
+                return CANCELLED
             row, column = texel // resolution, texel % resolution
             place = _morton(row, column)
             block = texel * BLOCKS // texels
@@ -260,7 +259,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
                         rounds = _points_of(spans[p, half], j)
                         into, spare = irradiance[p, block, scramble], lanes[SCRAMBLES_PER_HALF]
                         _sample_lights(t, ray, ray_bits, (x0, y0, z0), texel, texels, rounds, light_rate, light_key, normals, spare, into)
-    return _DONE
+    return DONE
 
 
 @entry_kernel
@@ -269,7 +268,7 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
     ray_bits = ray.view(np.uint32)
     for p in range(positions.shape[0]):
         if cancelled[0]:
-            return _CANCELLED
+            return CANCELLED
         for i in range(directions.shape[0]):
             dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
             distance[p, i] = np.inf
@@ -282,7 +281,7 @@ def _distance_kernel(t, ray, positions, directions, cancelled, distance, normal,
                 distance[p, i] = math.sqrt(x * x + y * y + z * z)
                 normal[p, i, 0], normal[p, i, 1], normal[p, i, 2] = n[0], n[1], n[2]
                 back[p, i] = not front and not t.materials.double_sided[material]
-    return _DONE
+    return DONE
 
 
 @dataclass(frozen=True)
@@ -366,7 +365,7 @@ def capture_radiance(
             sums,
             radiance[first:end],
         )
-        if status == _CANCELLED:
+        if status == CANCELLED:
             raise Cancelled
         return sums, rays_traced(ray)
 
@@ -445,6 +444,6 @@ def capture_distance(
     distance, normal = np.empty((len(positions), n)), np.empty((len(positions), n, 3), np.float32)
     back = np.empty((len(positions), n), np.bool_)
     ray = new_rayhit()
-    if _distance_kernel(tracer.tables, ray, positions, directions, cancelled, distance, normal, back) == _CANCELLED:
+    if _distance_kernel(tracer.tables, ray, positions, directions, cancelled, distance, normal, back) == CANCELLED:
         raise Cancelled
     return distance, normal, back, rays_traced(ray)

@@ -15,6 +15,9 @@ from numba.extending import overload
 
 from bake_core.kernel_cache import kernel_cache_dir
 
+# What a kernel answers that looks at a flag: whether it was told to stop.
+CANCELLED, DONE = 1, 0
+
 numba.config.CACHE_DIR = str(kernel_cache_dir())
 
 # A kernel that only other kernels call; LLVM inlines it as it sees fit.

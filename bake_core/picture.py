@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bake_core.embree import new_rayhit
 from bake_core.errors import Cancelled
-from bake_core.kernels import entry_kernel
+from bake_core.kernels import CANCELLED, DONE, entry_kernel
 from bake_core.progress import Progress, ProgressCallback
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.scene import Camera
@@ -20,7 +20,6 @@ from bake_core.tracer import Tracer
 from bake_core.transport import trace_path
 
 F32 = NDArray[np.float32]
-_CANCELLED, _DONE = 1, 0
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             if cancelled[0]:
-                return _CANCELLED
+                return CANCELLED
             key = mix64(mix64(seed) + (uint64(first_row + row) << uint64(32)) + uint64(column))
             for sample in range(samples):
                 index = uint32(sample)
@@ -82,7 +81,7 @@ def _picture_kernel(t, ray, eye, axes, first_row, samples, seed, cancelled, out)
                     out[row, column, 6 + c] += indirect[c]
                 if hit:
                     out[row, column, 9] += 1
-    return _DONE
+    return DONE
 
 
 def path_trace_picture(
@@ -131,7 +130,7 @@ def path_trace_picture(
 
     with ThreadPoolExecutor(threads) as pool:
         for status in pool.map(render, range(height)):
-            if status == _CANCELLED:
+            if status == CANCELLED:
                 raise Cancelled
             done += 1
             if progress is not None:

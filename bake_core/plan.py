@@ -26,6 +26,8 @@ T = TypeVar("T")
 
 # Probes that are traced to learn a scene's speed and noise; each gets the samples of a bake's own pilot.
 _PILOT_PROBES = 32
+# Probes that the light cache learns from for them: of a large bake all would take as long as a pass of the bake itself.
+_LEARNING_PROBES = 1024
 # An Embree 4 acceleration structure of triangles, of medium quality and robust, with its share of construction: bytes a triangle.
 _BVH_BYTES = 150
 # The interpreter with numba, Embree and OpenImageIO loaded.
@@ -240,7 +242,8 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     within = np.random.default_rng(prepared.spec.seed).random(count)
     chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
     part = {name: getattr(prepared, name)[chosen] for name in ("positions", "limits", "units", "needed")}
-    few = replace(prepared, **part)
+    light = prepared.light and prepared.light.of_some(_LEARNING_PROBES)
+    few = replace(prepared, **part, light=light)
     state, start = empty_state(few), Allocation.start(count)
     first, second = (0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)
     # No sample at all: distances alone.
@@ -268,7 +271,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
         fall=min(max(fell, 1.0), _STEEPEST),
         allocation=Allocation(state.taken[active], state.eighths[active]),
         times=len(wanted) / count,
-        learning_seconds=learning / (second[1] - second[0]),
+        learning_seconds=learning / (second[1] - second[0]) * (prepared.light.probes / light.probes if prepared.light and light else 0),
     )
 
 

@@ -71,7 +71,7 @@ class Prepared:
 
     def traced_with(self, tracer: Tracer) -> Prepared:
         """The same bake by other tables of the same scene."""
-        light = self.light and self.light.traced_with(tracer)
+        light = self.light and replace(self.light, tracer=tracer)
         return replace(self, tracer=tracer, whole=tracer, light=light)
 
     @property

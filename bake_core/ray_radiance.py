@@ -12,9 +12,9 @@ from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.bundle import VolumeData
-from bake_core.kernels import entry_kernel
+from bake_core.kernels import CANCELLED, DONE, entry_kernel
 from bake_core.light_field import Traces, arriving, light_field, trace
-from bake_core.receiver_irradiance import CANCELLED, DONE, estimate
+from bake_core.receiver_irradiance import estimate
 from bake_core.sampling import mix64, reverse_bits
 from bake_core.scene import Scene
 from bake_core.trace_check import Rays, draw_rays

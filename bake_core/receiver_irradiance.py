@@ -18,17 +18,15 @@ from numpy.typing import NDArray
 from bake_core.embree import new_rayhit
 from bake_core.environment import has_sky
 from bake_core.errors import Cancelled
-from bake_core.kernels import entry_kernel
-from bake_core.materials import INV_PI, lambert_cosine, no_gloss, sample_lambert
+from bake_core.kernels import CANCELLED, DONE, entry_kernel
+from bake_core.materials import no_gloss
 from bake_core.next_event import from_emitters, from_sky
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.tracer import Tracer
-from bake_core.transport import trace_path
+from bake_core.transport import trace_by_cosine
 
 F64 = NDArray[np.float64]
 
-# How a kernel of :func:`estimate` ends.
-CANCELLED, DONE = 1, 0
 # Points a thread takes at once: a fraction of a second's work.
 _CHUNK = 32
 
@@ -136,7 +134,6 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
     for i in range(out.shape[1]):
         s = stands[i]
         p, n, epsilon = (s[0], s[1], s[2]), (s[3], s[4], s[5], s[6], s[7], s[8]), s[9]
-        ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
         for scramble in range(out.shape[0]):
             if cancelled[0]:
                 return CANCELLED
@@ -158,17 +155,11 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
                     red += r
                     green += g
                     blue += b
-                u, v = sobol_pair(reversed_index, key)
-                dx, dy, dz = sample_lambert(u, v, n)
                 # Of no width: a look-up in a texture that is as fine as it can be is no estimate of what a wider one would have found.
-                emitted, direct, indirect, _, light_pdf = trace_path(
-                    t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, False, 0.0, 0
-                )
-                pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
-                share = pdf / (pdf + light_pdf) if light_pdf > 0 else 1.0
-                red += share * emitted[0] + direct[0] + indirect[0]
-                green += share * emitted[1] + direct[1] + indirect[1]
-                blue += share * emitted[2] + direct[2] + indirect[2]
+                r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, epsilon, reversed_index, index, key, False, 0)
+                red += r
+                green += g
+                blue += b
             # Over the pdf cosθ/π, radiance times cosine is π times radiance.
             scale = math.pi / samples
             out[scramble, i, 0], out[scramble, i, 1], out[scramble, i, 2] = scale * red, scale * green, scale * blue

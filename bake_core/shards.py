@@ -84,6 +84,8 @@ def trace_shard(
         advance=advance,
     )
     empty = np.zeros
+    # What all shards share is counted once.
+    learning = prepared.light.rays(samples) if prepared.light is not None and probes[0] == 0 and samples[1] > samples[0] else 0
     return Tally(
         *probes,
         *samples,
@@ -95,6 +97,7 @@ def trace_shard(
         distance=seen.get("distance", empty((0, 0), np.float32)),
         normal=seen.get("normal", empty((0, 0, 0), np.float32)),
         rays=rays + looked,
+        learning=learning,
     )
 
 
@@ -110,7 +113,7 @@ def lit(prepared: Prepared, samples: tuple[int, int], *, threads: int, cancelled
         return prepared.tracer
     if samples[0] == samples[1]:
         return light.blank()
-    return light.tracer(samples[1], threads=threads, cancelled=np.zeros(1, np.uint8) if cancelled is None else cancelled)
+    return light.known(samples[1], threads=threads, cancelled=np.zeros(1, np.uint8) if cancelled is None else cancelled)
 
 
 def _spread(values: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -41,6 +40,7 @@ _POINT_BYTES, _CELL_BYTES = 2 * 114, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
 _SEED = 0x11C4C3E5
 
 
+@dataclass(eq=False)
 class SurfaceLight:
     """What is known of the light on surfaces when a pass begins.
 
@@ -48,7 +48,9 @@ class SurfaceLight:
     the points and the paths from each grow, and every second stage cells are half as large, so that what they smooth away goes to zero
     as well. In the first stage a quarter of the points are path-traced to their ends, and the others' paths end in those.
 
-    Parameters
+    ``dataclasses.replace`` makes one of another seed or tracer, that has learnt nothing yet.
+
+    Attributes
     ----------
     tracer : Tracer
         Without a cache.
@@ -58,40 +60,52 @@ class SurfaceLight:
         Each one's smallest spacing, metres.
     texels : int
         Of a probe's capture map.
-
-    Attributes
-    ----------
+    seed : int
     cached : float
-        The share of what probes see that was known at first, once :meth:`survey` has looked.
+        The share of what probes see that is known at first (:meth:`survey`).
     """
 
-    def __init__(self, tracer: Tracer, positions: F64, units: F64, texels: int, seed: int) -> None:
-        self.cached, self._made = 0.0, (positions, units, texels, seed)
-        self._tracer, self._seed = tracer, seed ^ _SEED
-        some = np.random.default_rng(self._seed).permutation(len(positions))[:_MOST_PROBES]
-        self._positions = np.ascontiguousarray(positions[np.sort(some)])
-        self._smallest, self._largest = float(units.min()), float(units.max())
+    tracer: Tracer
+    positions: F64
+    units: F64
+    texels: int
+    seed: int
+    cached: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._seed = self.seed ^ _SEED
+        some = np.random.default_rng(self._seed).permutation(len(self.positions))[:_MOST_PROBES]
+        self._positions = np.ascontiguousarray(self.positions[np.sort(some)])
+        self._smallest, self._largest = float(self.units.min()), float(self.units.max())
         # Of each probe and scramble.
-        self._first_paths = max(round(_SHARE * texels * FIRST_SAMPLES / SCRAMBLES), 1)
-        self._most_rounds = max(_MOST_POINTS // max(len(self._positions) * SCRAMBLES, 1), 1)
+        self._first_paths = max(round(_SHARE * self.texels * FIRST_SAMPLES / SCRAMBLES), 1)
+        self._most_rounds = max(_MOST_POINTS // max(self.probes * SCRAMBLES, 1), 1)
         self._lock = threading.Lock()
         self.forget()
 
     @property
     def _limited(self) -> bool:
-        return bool(self._tracer.tables.max_bounces < np.iinfo(np.int32).max)
+        return bool(self.tracer.tables.max_bounces < np.iinfo(np.int32).max)
+
+    @property
+    def probes(self) -> int:
+        """How many it learns from: all, or as many as a large bake has of them."""
+        return len(self._positions)
+
+    def of_some(self, probes: int) -> SurfaceLight:
+        """What so many of its probes would learn, or all of fewer."""
+        return replace(self, positions=np.random.default_rng(self._seed).permutation(self._positions)[:probes])
 
     def survey(self, threads: int) -> float:
         """The share of what probes see that the first stage will know where nothing is in the way; no path is traced for it."""
         never = np.zeros(1, np.uint8)
-        points, met = find_points(self._tracer, self._positions, (0, self._rounds(0)), self._seed, threads=threads, cancelled=never)
+        found = find_points(self.tracer, self._positions, (0, self.rounds(0)), self._seed, threads=threads, cancelled=never)
         grid = self._grid(0)
-        code = codes(grid, points) >> np.uint64(3 * (int(grid[4]) - 1))
+        code = codes(grid, found.points) >> np.uint64(3 * (int(grid[4]) - 1))
         _, cell, count = np.unique(code, return_inverse=True, return_counts=True)
-        self.cached = float((count[cell] >= HALVES * FEWEST).sum() / met) if met else 0.0
-        return self.cached
+        return float((count[cell] >= HALVES * FEWEST).sum() / found.met) if found.met else 0.0
 
-    def tracer(self, samples: int, *, threads: int, cancelled: Flag) -> Tracer:
+    def known(self, samples: int, *, threads: int, cancelled: Flag) -> Tracer:
         """What a pass that ends at so many samples traces with.
 
         Raises
@@ -101,63 +115,56 @@ class SurfaceLight:
         """
         stage = _stage(samples)
         with self._lock:
-            if stage < self._stage:
+            if stage < self._learnt:
                 self.forget()
-            while self._stage < stage:
-                self._learn(self._stage + 1, threads, cancelled)
+            while self._learnt < stage:
+                self._learn(self._learnt + 1, threads, cancelled)
             return self._cached
 
-    def traced_with(self, tracer: Tracer) -> SurfaceLight:
-        """The same by other tables of the same scene; nothing learnt yet."""
-        return SurfaceLight(tracer, *self._made)._surveyed(self.cached)
-
-    def seeded(self, seed: int) -> SurfaceLight:
-        """The same by other random numbers; nothing learnt yet."""
-        return SurfaceLight(self._tracer, *self._made[:-1], seed)._surveyed(self.cached)
-
-    def _surveyed(self, cached: float) -> SurfaceLight:
-        self.cached = cached
-        return self
+    def rays(self, samples: tuple[int, int]) -> int:
+        """Rays that it took to learn what a pass over these samples is the first to know, once :meth:`known` has been asked."""
+        return sum(self._rays[_stage(samples[0]) + 1 if samples[0] else 0 : _stage(samples[1]) + 1])
 
     def bytes(self, samples: int) -> int:
         """What is held at most, once so many samples have been taken."""
-        points = len(self._positions) * SCRAMBLES * self._rounds(_stage(samples))
+        points = self.probes * SCRAMBLES * self.rounds(_stage(samples))
         return points * (_POINT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
 
     def blank(self) -> Tracer:
         """The tracer with a cache that knows nothing: for kernels that are to be compiled, and who starts to learn."""
-        return _with(self._tracer, empty_cache(SCRAMBLES))
+        return _with(self.tracer, empty_cache(SCRAMBLES))
 
     def compile(self) -> None:
         """Compile, or fetch from the cache on disk, the kernels that learn: from no point."""
         never, points = np.zeros(1, np.uint8), Points.none()
-        find_points(self._tracer, self._positions, (0, 0), self._seed, threads=1, cancelled=never)
+        find_points(self.tracer, self._positions, (0, 0), self._seed, threads=1, cancelled=never)
         gather_light(self.blank(), points, (0, 1), threads=1, cancelled=never)
-        average(self._tracer, points, 1, self._grid(0), threads=1)
+        average(self.tracer, points, 1, self._grid(0), threads=1)
 
     def forget(self) -> None:
         """Hold nothing any more; whoever asks again has it learnt anew."""
-        self._stage, self._points, self._cached = -1, Points.none(), self.blank()
+        self._learnt, self._points, self._cached = -1, Points.none(), self.blank()
+        self._rays: list[int] = []
 
     def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:
-        rounds, paths = self._rounds(stage), self._paths(stage)
-        before = (self._rounds(stage - 1), self._paths(stage - 1)) if stage else (0, 0)
-        old = replace(self._points, light=self._points.light.copy())
-        tracer = self._teacher()
-        if len(old) and paths > before[1]:
-            gather_light(tracer, old, (before[1], paths), threads=threads, cancelled=cancelled)
-        steps: Sequence[int] = (before[0], rounds)
-        if stage == 0 and not self._limited and rounds > 3:
-            steps = (0, rounds // 4, rounds)
-        grid, points = self._grid(stage), old
-        for step, (begin, end) in enumerate(pairwise(steps)):
-            if step:
-                tracer = _teaching(_with(tracer, average(tracer, points, paths, grid, threads=threads)))
-            new, _ = find_points(self._tracer, self._positions, (begin, end), self._seed, threads=threads, cancelled=cancelled)
-            gather_light(tracer, new, (0, paths), threads=threads, cancelled=cancelled)
-            points = points + new
-        cache = average(self._tracer, points, paths, grid, threads=threads)
-        self._stage, self._points, self._cached = stage, points, _with(self._tracer, cache)
+        paths, rounds = self.paths(stage), [0, self.rounds(stage)]
+        points = replace(self._points, light=self._points.light.copy())
+        grid, tracer, rays = self._grid(stage), self._teacher(), 0
+        if stage:
+            rounds[0] = self.rounds(stage - 1)
+            rays += gather_light(tracer, points, (self.paths(stage - 1), paths), threads=threads, cancelled=cancelled)
+        elif not self._limited and rounds[1] > 3:
+            rounds.insert(1, rounds[1] // 4)
+        for part in pairwise(rounds):
+            if len(points) and not stage:
+                cache, traced = average(self.tracer, points, paths, grid, threads=threads)
+                tracer, rays = _teaching(_with(self.tracer, cache)), rays + traced
+            found = find_points(self.tracer, self._positions, part, self._seed, threads=threads, cancelled=cancelled)
+            rays += found.rays + gather_light(tracer, found.points, (0, paths), threads=threads, cancelled=cancelled)
+            points = points + found.points
+        cache, traced = average(self.tracer, points, paths, grid, threads=threads)
+        self._learnt, self._points, self._cached = stage, points, _with(self.tracer, cache)
+        self._rays.append(rays + traced)
 
     def _teacher(self) -> Tracer:
         """What paths from points are traced with: a cache ends them, unless it knows of one bounce too many."""
@@ -166,12 +173,12 @@ class SurfaceLight:
         blank = self.blank()
         return replace(blank, tables=blank.tables._replace(max_bounces=np.int64(blank.tables.max_bounces - 1)))
 
-    def _rounds(self, stage: int) -> int:
+    def rounds(self, stage: int) -> int:
         """Points of each probe and scramble; the paths from each make up for the stages in which they do not grow."""
         return min(max(self._first_paths // _PATHS, 1) << ((stage + 1) // 2), self._most_rounds)
 
-    def _paths(self, stage: int) -> int:
-        return max((self._first_paths << stage) // self._rounds(stage), 1)
+    def paths(self, stage: int) -> int:
+        return max((self._first_paths << stage) // self.rounds(stage), 1)
 
     def _grid(self, stage: int) -> F64:
         smallest = self._smallest * _SMALLEST / 2 ** (stage // 2)
@@ -196,8 +203,8 @@ def surface_light(spec: Spec, tracer: Tracer, positions: F64, units: F64, texels
     if spec.integrator == "path" or bounces < 2 or (spec.integrator == "auto" and len(positions) < FEWEST_PROBES):
         return None
     light = SurfaceLight(tracer, positions, units, texels, spec.seed)
-    enough = light.survey(threads) >= _COVERED
-    return light if enough or spec.integrator == "cache" else None
+    light.cached = light.survey(threads)
+    return light if light.cached >= _COVERED or spec.integrator == "cache" else None
 
 
 def _teaching(tracer: Tracer) -> Tracer:

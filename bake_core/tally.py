@@ -48,6 +48,8 @@ class Tally(Stored):
     normal : (k, n², 3) float32 or (0, 0, 0)
     rays : int
         Traced for all of it.
+    learning : int
+        Rays beside them, of what the light cache has learnt for all of the pass: its first shard tells of them.
     """
 
     first_probe: int
@@ -62,6 +64,7 @@ class Tally(Stored):
     distance: F32
     normal: F32
     rays: int
+    learning: int
 
 
 @dataclass
@@ -113,7 +116,7 @@ class State(Stored):
             kept = t.first_probe + np.flatnonzero(self.active()[probes])
             self.taken[probes] = t.taken
             self.irradiance[kept] += t.irradiance
-            self.rays += t.rays
+            self.rays += t.rays + t.learning
             if self.radiance.size:
                 self.radiance[kept] += t.radiance
             if first == 0:

@@ -231,3 +231,33 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         x, y, z = ox, oy, oz
         passed = 0
     return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, light_pdf
+
+
+@kernel
+def trace_by_cosine(t, ray, ray_bits, p, n, epsilon, reversed_index, index, key, wide, scramble):  # type: ignore[no-untyped-def]
+    """One path that leaves a matt surface: what the next ray brings beside :mod:`bake_core.next_event`, an estimate of ∫ L cosθ dω / π.
+
+    Parameters
+    ----------
+    p : 3 float64
+    n : 6 float64
+        Geometric and shading normal.
+    wide : bool
+        Whether the ray stands for as much as its density says, as one does that was scattered here; else textures are as fine as can be.
+
+    Other parameters are :func:`trace_path`'s; what the ray meets has the share that the balance heuristic gives it.
+    """
+    u, v = sobol_pair(reversed_index, key)
+    dx, dy, dz = sample_lambert(u, v, n)
+    pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
+    spread = scattered_spread(t, 0.0, pdf) if wide else 0.0
+    x, y, z = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
+    emitted, direct, indirect, _, light_pdf = trace_path(
+        t, ray, ray_bits, x, y, z, dx, dy, dz, reversed_index, index, key, False, spread, scramble
+    )
+    share = pdf / (pdf + light_pdf) if light_pdf > 0 else 1.0
+    return (
+        share * emitted[0] + direct[0] + indirect[0],
+        share * emitted[1] + direct[1] + indirect[1],
+        share * emitted[2] + direct[2] + indirect[2],
+    )

@@ -232,10 +232,10 @@ def measure(
     side = prepare(load_scene(scene_path), spec, find).selection.capture
     small = spec.resolution.model_copy(update={"radiance": side, "irradiance": SMALLEST_RESOLUTION, "distance": side})
     spec = spec.model_copy(update={"outputs": ("radiance",), "resolution": small})
-    prepared = prepare(load_scene(scene_path), spec, find)
+    prepared = prepare(load_scene(scene_path), spec.model_copy(update={"integrator": "cache"}), find)
     with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder, ExitStack() as stack:
         truth = _reference(scene_path, spec, prepared.volumes, find, threads, reference_samples, reference, side, Path(folder), say)
-        integrators = ("path", "cache") if prepared.tracer.tables.max_bounces > 1 else ("path",)
+        integrators = ("path",) if prepared.light is None else ("path", "cache")
         racing: list[_Ours | Peer] = [_Ours(scene_path, spec, find, threads, Path(folder), i) for i in integrators]
         left_out = []
         given: dict[str, Any] | None = None

@@ -41,7 +41,8 @@ def _lines(manifest: dict[str, Any], report: dict[str, Any] | None, digest: str)
         f"made by    {manifest['generator']} on {manifest['instruction_set']}",
         f"scene      {manifest['scene']['digest']}, {manifest['scene']['triangles']} triangles",
         f"samples    {manifest['samples']}, stopped by {manifest['stopped']}",
-        f"paths      {integrator_in_words(manifest)}",
+        # What was made of pictures has traced none.
+        *([f"paths      {integrator_in_words(manifest)}"] if manifest["samples"] else []),
         f"error      {percent(error['value'])} (target {percent(error['target'])}), sampling only",
         f"size       {size} bytes",
     ]

@@ -137,7 +137,7 @@ SCENES: tuple[tuple[str, Callable[[Path], Prepared], float], ...] = (
 
 def _baked(prepared: Prepared, seed: int, stop: Stop) -> State:
     spec = prepared.spec.model_copy(update={"seed": seed, "stop": stop})
-    light = prepared.light and prepared.light.seeded(seed)
+    light = prepared.light and replace(prepared.light, seed=seed)
     return gather(replace(prepared, spec=spec, light=light), Run(THREADS, 1), Clock(spec, None))
 
 

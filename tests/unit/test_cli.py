@@ -12,7 +12,7 @@ import time
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,7 +22,9 @@ from bake_core.bundle import content_digest, read_bundle
 from bake_core.convergence import Point
 from bake_core.examples import closed_box, square_emitter
 from bake_core.progress import Progress
+from bake_core.spec import Spec
 from service.cli import COMMANDS, main, parser
+from service.cli.bake import INTEGRATORS
 from service.cli.progress import ProgressLine, count
 from tests.conformance import synthetic
 from tests.faults.corpus import Fault, corpus
@@ -72,6 +74,19 @@ def test_bake_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "8 probes, 4 samples" in baked and audited.startswith("audit, ")
     assert "tracing" in err and "\r" not in err  # plain lines: this is no terminal
     read_bundle(tmp_path / "out")
+
+
+def test_bake_may_be_told_another_integrator_than_the_spec_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert get_args(Spec.model_fields["integrator"].annotation) == INTEGRATORS
+    glb, spec = closed_box(0.5, 1.0)
+    scene, spec_file = write(tmp_path, glb, {**spec, "stop": FEW})
+    for name, ended in (("path", "traced to their ends"), ("cache", "ended in the light cache, which knew")):
+        out = str(tmp_path / name)
+        assert main(["bake", scene, "--spec", spec_file, "-o", out, "--integrator", name, "--audit-seconds", "0"]) == 0
+        manifest = read_bundle(out).manifest
+        assert manifest["spec"]["integrator"] == name and (manifest["sampling"]["cached"] is None) == (name == "path")
+        capsys.readouterr()
+        assert main(["info", out]) == 0 and f"paths      {ended}" in capsys.readouterr().out
 
 
 def test_bake_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

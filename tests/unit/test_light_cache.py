@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.allocation import SCRAMBLES, Allocation
+from bake_core.allocation import Allocation
 from bake_core.bake import empty_state
 from bake_core.cache_cells import codes
 from bake_core.cache_points import Points
 from bake_core.errors import Cancelled
-from bake_core.examples import Example, closed_box, cornell, two_rooms
+from bake_core.examples import Example, box_sides, closed_box, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.light_cache import AXIS_CELLS, cell_key, cell_of, facing
 from bake_core.octahedral import texel_directions
@@ -33,6 +33,8 @@ from tests.unit.gltf_build import load_glb
 Array = NDArray[Any]
 # Of a box from -1 to 1.
 _INSIDE = {"origin": [-0.75, -0.75, -0.75], "spacing": [0.5, 0.5, 0.5], "counts": [4, 4, 4]}
+# Of a Cornell box.
+_IN_CORNELL = {"origin": [-0.75, 0.25, -0.75], "spacing": [0.5, 0.5, 0.5], "counts": [4, 4, 4]}
 
 
 def prepared(example: Example, **spec: Any) -> Prepared:
@@ -96,21 +98,22 @@ def test_a_closed_box_has_the_closed_form_s_light(bounces: int | None) -> None:
     assert traced(p).mean().mean() == pytest.approx(expected, rel=2e-3)
 
 
-def test_it_agrees_with_paths_within_what_both_say_of_themselves() -> None:
-    spec = {"volumes": [{"fit": "scene", "counts": [5, 5, 5]}]}
-    cache, path = (traced(prepared(cornell(), integrator=i, **spec), (16, 32, 64)) for i in ("cache", "path"))
-    active = np.flatnonzero(cache.active())
-    assert np.array_equal(cache.active(), path.active())
-    squares = ((cache.mean(active) - path.mean(active)) ** 2).sum(-1)
-    ours, theirs = cache.spread(), path.spread()
-    assert ours is not None and theirs is not None
-    scale = theirs.square + theirs.floor()
-    found, stated = (squares / scale).mean(), ((ours.variance + theirs.variance) / scale).mean()
-    # What cells smooth away is less than what both do not know, and it knows more than paths do. All probes share its luck.
-    assert 0.3 * stated < found < 1.5 * stated
-    assert (ours.variance / scale).mean() < 0.6 * (theirs.variance / scale).mean()
-    assert cache.mean(active).mean() == pytest.approx(path.mean(active).mean(), rel=0.01)
-    assert cache.rays < 0.7 * path.rays
+def test_it_differs_from_paths_by_what_both_state() -> None:
+    """Over four seeds, for all probes share what one has learnt: squared differences over stated variances, and mean irradiance."""
+    ratios, means = [], []
+    for seed in range(1, 5):
+        cache, path = (traced(prepared(cornell(), integrator=i, seed=seed, volumes=[_IN_CORNELL]), (16, 32, 64)) for i in ("cache", "path"))
+        ours, theirs = cache.spread(), path.spread()
+        assert ours is not None and theirs is not None
+        scale = theirs.square + theirs.floor()
+        active = np.flatnonzero(cache.active())
+        squares = ((cache.mean(active) - path.mean(active)) ** 2).sum(-1)
+        ratios.append((squares / scale).mean() / ((ours.variance + theirs.variance) / scale).mean())
+        means.append(cache.mean(active).mean() / path.mean(active).mean() - 1)
+        assert (ours.variance / scale).mean() < (theirs.variance / scale).mean() and cache.rays < 0.6 * path.rays
+    # 0.86 ± 0.06 and ± 0.03 %: a cache that hid its noise or smoothed too much would be above, one that told of too much below.
+    assert 0.7 < np.mean(ratios) < 1.15
+    assert abs(np.mean(means)) < 0.0015
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
@@ -124,30 +127,19 @@ def test_a_dark_room_beside_a_bright_one_stays_exactly_dark(scale: float) -> Non
 
 
 def test_what_sticks_through_a_floor_is_not_read_from_below() -> None:
-    """A post that stands in a lit room and reaches through its floor, with probes below: its cells straddle the floor."""
-    w, grey = GlbWriter(), (0.6, 0.6, 0.6)
-    for height in (0.0, 2.0):
-        add_square(w, f"at {height:g} m", grey, matrix=_placed(4, 4, y=height), double_sided=True)
-    for i in range(4):
-        turn = i * math.pi / 2
-        about = np.array([[math.cos(turn), 0, math.sin(turn), 0], [0, 1, 0, 0], [-math.sin(turn), 0, math.cos(turn), 0], [0, 0, 0, 1]])
-        upright = np.array([[0, 1, 0, 0.5], [0.2, 0, 0, 0.1], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-        add_square(w, f"post {i}", grey, matrix=about @ upright, double_sided=True)
-    add_square(w, "lamp", (0.0, 0.0, 0.0), emission=(5.0, 5.0, 5.0), matrix=_placed(1, 1, y=1.9), double_sided=True)
-    below = {"origin": [-0.9, -0.8, -0.9], "spacing": [0.6, 0.3, 0.6], "counts": [4, 2, 4]}
-    above = {"origin": [-0.9, 0.3, -0.9], "spacing": [0.6, 0.4, 0.6], "counts": [4, 4, 4]}
-    spec = {"version": 1, "volumes": [below, above], "probes": "lattice", "max_bounces": 4}
-    p = prepare(load(w), parse_spec({**spec, "integrator": "cache"}), threads=2)
-    path = traced(replace(p, light=None), (16, 32))
-    state = traced(p, (16, 32))
-    assert state.mean(slice(0, 32)).mean() == pytest.approx(path.mean(slice(0, 32)).mean(), rel=0.05)
-
-
-def _placed(x: float, z: float, *, y: float) -> Array:
-    """A matrix that makes the unit square this large, so high."""
-    matrix = np.diag([x, 1, z, 1.0])
-    matrix[1, 3] = y
-    return matrix
+    """A post in a sealed, lit room reaches through its floor, and probes stand below: the post's cells straddle the floor."""
+    w = GlbWriter()
+    wall = w.material("wall", (0.6, 0.6, 0.6), double_sided=True)
+    boxes = [box_sides((-1.5, 0, -1.5), (1.5, 2, 1.5)), box_sides((-0.2, -0.5, -0.2), (0.2, 0.5, 0.2))]
+    w.node("room", mesh=w.mesh("room", [quads_part(box, wall) for box in boxes]))
+    lamp = np.diag([1, 1, 1, 1.0])
+    lamp[1, 3] = 1.9
+    add_square(w, "lamp", (0.0, 0.0, 0.0), emission=(5.0, 5.0, 5.0), matrix=lamp, double_sided=True)
+    below = {"origin": [-0.6, -0.45, -0.6], "spacing": [0.4, 0.3, 0.4], "counts": [4, 2, 4]}
+    above = {"origin": [-0.6, 0.15, -0.6], "spacing": [0.4, 0.3, 0.4], "counts": [4, 4, 4]}
+    p = prepare(load(w), parse_spec({"volumes": [below, above], "probes": "lattice", "integrator": "cache"}), threads=2)
+    means = traced(p).mean()
+    assert means[32:].mean() > 1 and not means[:32].any()
 
 
 # --- where it is made --------------------------------------------------------------------------------------------------------------
@@ -159,13 +151,16 @@ def test_threads_shards_and_a_process_that_takes_over_change_no_bit() -> None:
     split = traced(prepared(cornell(), **spec), shards=3, threads=2)
     assert np.array_equal(whole.irradiance, split.irradiance)
     late = prepared(cornell(), **spec)
-    given = Allocation(whole.taken * 0 + 8, whole.eighths)
-    first = trace_shard(prepared(cornell(), **spec), (0, 64), (0, 16), Allocation.start(64), threads=2)
-    second = trace_shard(late, (0, 64), (16, 32), given, threads=2)
     both = empty_state(late)
+    first = trace_shard(prepared(cornell(), **spec), (0, 64), (0, 16), Allocation.start(64), threads=2)
     both.add([first])
+    second = trace_shard(late, (0, 64), (16, 32), both.allocation, threads=2)
     both.add([second])
     assert np.array_equal(whole.irradiance, both.irradiance)
+    # What was learnt is counted, and once, whoever learnt it; each of its points takes 16 paths.
+    assert whole.rays == split.rays == both.rays == first.rays + first.learning + second.rays + second.learning
+    assert min(first.learning, second.learning) > 16 * 1000
+    assert trace_shard(late, (1, 64), (0, 16), Allocation.start(64), threads=2).learning == 0
     # Back to an earlier stage, as a job does that is run again.
     assert np.array_equal(trace_shard(late, (0, 64), (0, 16), Allocation.start(64), threads=2).irradiance, first.irradiance)
 
@@ -174,7 +169,7 @@ def test_who_is_stopped_while_it_learns_begins_again() -> None:
     p = prepared(cornell(), integrator="cache", volumes=[{"fit": "scene", "counts": [4, 4, 4]}])
     assert p.light is not None
     with pytest.raises(Cancelled):
-        p.light.tracer(16, threads=2, cancelled=np.ones(1, np.uint8))
+        p.light.known(16, threads=2, cancelled=np.ones(1, np.uint8))
     afresh = prepared(cornell(), integrator="cache", volumes=[{"fit": "scene", "counts": [4, 4, 4]}])
     assert np.array_equal(traced(p, (16,)).irradiance, traced(afresh, (16,)).irradiance)
 
@@ -183,24 +178,22 @@ def test_a_large_bake_holds_no_more_points_than_it_may() -> None:
     """Many probes of many texels: more paths from each point instead, and the same number of them in all."""
     light = prepared(cornell(), integrator="cache").light
     assert light is not None
-    tracer = light.blank()
     for probes, texels in ((512, 256), (512, 64 * 64), (20_000, 64 * 64), (1 << 20, 256)):
-        large = SurfaceLight(tracer, np.zeros((probes, 3)), np.ones(probes), texels, 0)
+        large = replace(light, positions=np.zeros((probes, 3)), units=np.ones(probes), texels=texels)
         assert large.bytes(1 << 20) < 1.2e9
         for stage in range(8):
-            assert large._rounds(stage) * large._paths(stage) == pytest.approx(texels / 2 * 2**stage, rel=0.5)
+            assert large.rounds(stage) * large.paths(stage) == texels // 2 << stage
 
 
 # --- when it is used ---------------------------------------------------------------------------------------------------------------
 
 
 def test_auto_takes_it_where_it_pays() -> None:
-    inside = {"origin": [-0.75, 0.25, -0.75], "spacing": [0.5, 0.5, 0.5]}
-    many, few = [{**inside, "counts": [4, 4, 4]}], [{**inside, "counts": [4, 4, 3]}]
-    assert isinstance(prepared(cornell(), volumes=many).light, SurfaceLight)
-    assert prepared(cornell(), volumes=few).light is None, "nothing to share"
-    assert prepared(cornell(), volumes=many, max_bounces=1).light is None, "nothing to know"
-    assert prepared(closed_box(0.5, 1.0, roughness=0.5), volumes=[_INSIDE]).light is None, "no surface is matt"
-    assert prepared(cornell(), volumes=many, integrator="path").light is None
-    assert prepared(cornell(), volumes=few, integrator="cache").light is not None
-    assert prepared(cornell(), volumes=many).light.blank().tables.cache.light.shape[1] == SCRAMBLES  # type: ignore[union-attr]
+    # On the lattice, so that nothing is traced to find out where probes are better off.
+    many, few = [_IN_CORNELL], [{**_IN_CORNELL, "counts": [4, 4, 3]}]
+    assert isinstance(prepared(cornell(), probes="lattice", volumes=many).light, SurfaceLight)
+    assert prepared(cornell(), probes="lattice", volumes=few).light is None, "nothing to share"
+    assert prepared(cornell(), probes="lattice", volumes=many, max_bounces=1).light is None, "nothing to know"
+    assert prepared(closed_box(0.5, 1.0, roughness=0.5), probes="lattice", volumes=[_INSIDE]).light is None, "no surface is matt"
+    assert prepared(cornell(), probes="lattice", volumes=many, integrator="path").light is None
+    assert prepared(cornell(), probes="lattice", volumes=few, integrator="cache").light is not None

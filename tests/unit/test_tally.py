@@ -37,6 +37,7 @@ def tally(probes: tuple[int, int], samples: tuple[int, int], *, seed: int = 0, r
         distance=np.full((len(kept), 4), 2.0, np.float32) if first else np.zeros((0, 0), np.float32),
         normal=np.full((len(kept), 4, 3), 1.0, np.float32) if first else np.zeros((0, 0, 0), np.float32),
         rays=10 * n,
+        learning=7 if probes[0] == 0 else 0,
     )
 
 
