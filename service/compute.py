@@ -105,6 +105,16 @@ class Compute:
         """Drop tasks that wait, and raise the cancel flag of those that run."""
         self._client.cancel(futures, force=True)
 
+    def release(self, future: Future[Any]) -> None:
+        """Forget what came of a task.
+
+        Left to the garbage collector, an error would stay for good: Dask's client holds it as long as there is the future, its traceback
+        the frames it went through, and those the future.
+        """
+        # The client may have closed under its caller.
+        with suppress(RuntimeError):
+            future.release()
+
     def restart(self, address: str) -> None:
         """Kill a worker that does not hear; another is started in its place."""
         log.warning("restarting the worker at %s, which does not stop", address)

@@ -315,6 +315,8 @@ class Driver:
                     waiting.appendleft(piece)
                 else:
                     advance(max(0.0, 1.0 - piece.told))
+                finally:
+                    self._compute.release(future)
             elif news["key"] in running:
                 begun[news["key"]] = news["address"]
                 if "progress" in news:

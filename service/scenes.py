@@ -16,8 +16,8 @@ from bake_core.spec import ConstantEnvironment, EquirectEnvironment
 from service.blobs import DIGEST, Blobs
 from service.sandbox import Sandbox
 
-# Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each.
-KEPT_OUTLINES = 64
+# Outlines hold a scene's nodes, lights and materials but not its geometry: kilobytes each, but for a scene of a million nodes.
+KEPT_OUTLINES, KEPT_NODES = 64, 100_000
 # Read one at a time: the largest takes 1 GB for a moment.
 _one_sky = threading.Lock()
 
@@ -58,7 +58,7 @@ def check_sky(sandbox: Sandbox, blobs: Blobs, environment: ConstantEnvironment |
 
 
 class Outlines:
-    """The last scenes asked for, without their geometry and images."""
+    """The last scenes asked for, as many as a hundred megabytes hold, without their geometry and images."""
 
     def __init__(self, blobs: Blobs, sandbox: Sandbox) -> None:
         self._blobs = blobs
@@ -84,6 +84,6 @@ class Outlines:
         outline, contents = self._sandbox.call("read_outline", root, dict(files), where=root)
         with self._lock:
             self._kept[outline.digest] = outline
-            while len(self._kept) > KEPT_OUTLINES:
+            while len(self._kept) > KEPT_OUTLINES or sum(len(kept.nodes) for kept in self._kept.values()) > KEPT_NODES:
                 self._kept.popitem(last=False)
         return outline, contents

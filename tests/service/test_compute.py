@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import gc
 import os
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from distributed.client import FutureState
 from distributed.scheduler import TaskGroup, Transition
 
 from service.compute import Compute
+from service.driver import Driver
+from service.jobs import Kind
+from service.parts import Service
 from service.settings import Settings
 
 # Enough that Dask by itself would remember a hundred groups of tasks and a thousand changes of their states.
@@ -42,3 +48,22 @@ def test_what_a_task_raises_is_told_once(tmp_path: Path, capfd: pytest.CaptureFi
     finally:
         compute.close()
     assert "ZeroDivisionError" not in "".join(capfd.readouterr())
+
+
+def test_a_task_that_failed_is_forgotten_when_its_driver_knows(service: Service) -> None:
+    """Its error refers to the driver's frames, and these to the future that keeps the error."""
+    service.settings.temporary_folder.mkdir(exist_ok=True)
+    compute = Compute(service.settings, lambda _: None)
+    try:
+        job = service.store.add_job(Kind.BAKE, {}, {}, 0)
+        driver = Driver(job, service.settings, service.store, service.blobs, compute, service.hub)
+        for _ in range(3):
+            with suppress(ZeroDivisionError):
+                driver._one(divmod, 1, 0)
+        # The client is told in its own thread.
+        end = time.monotonic() + 5
+        while kept := sum(isinstance(thing, FutureState) for thing in gc.get_objects()):
+            assert time.monotonic() < end, kept
+            gc.collect()
+    finally:
+        compute.close()

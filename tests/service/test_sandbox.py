@@ -13,6 +13,7 @@ import subprocess
 import threading
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -20,6 +21,7 @@ import pytest
 from bake_core.errors import OctobakeError, SceneError
 from service.parts import Service
 from service.sandbox import _Answer
+from service.scenes import Outlines
 from tests.service.running import BOX, InProcess, wait_for
 
 
@@ -127,3 +129,20 @@ def test_an_answer_that_is_no_outline_calls_nothing() -> None:
 
     with pytest.raises(SceneError, match="no outline"):
         _Answer(io.BytesIO(pickle.dumps(("done", Evil())))).load()
+
+
+def test_scenes_of_many_nodes_are_not_kept_by_the_dozen(service: Service) -> None:
+    """A hundred bytes and more a node: 64 scenes of a million would be gigabytes. One that alone is too large is read each time."""
+    asked: list[str] = []
+
+    def call(_: str, root: str, *__: object, **___: object) -> tuple[SimpleNamespace, dict[str, object]]:
+        asked.append(root)
+        return SimpleNamespace(digest=root, nodes=range(int(root.split("-")[0]) * 1000)), {}
+
+    outlines = Outlines(service.blobs, SimpleNamespace(call=call))  # type: ignore[arg-type]
+    for _ in range(2):
+        for root in ("40-a", "40-b", "40-c", "1000-d"):
+            outlines.get(root, {"root": root, "files": {}})
+    outlines.get("1-e", {"root": "1-e", "files": {}})
+    outlines.get("1-e", {"root": "1-e", "files": {}})
+    assert asked == ["40-a", "40-b", "40-c", "1000-d"] * 2 + ["1-e"]
