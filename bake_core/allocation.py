@@ -26,14 +26,14 @@ I64 = NDArray[np.int64]
 
 # Independent scrambles of every sample sequence. Their spread is the bake's error: Sobol' points themselves are not independent.
 HALVES = 2
-SCRAMBLES_PER_HALF = 8
+SCRAMBLES_PER_HALF = 4
 SCRAMBLES = HALVES * SCRAMBLES_PER_HALF
 # The first two passes are everybody's.
-PILOT_SAMPLES = 2 * SCRAMBLES
+PILOT_SAMPLES = 4 * SCRAMBLES
 # Densities are counted in eighths; the least is one, so that a probe that saw nothing of a rare light in the pilot looks again.
 FULL = 8
 # How much of the target may be spent on sampling easy probes less, if the sample limit is to be enough all the same. The rest is for what
-# seven degrees of freedom do not know, and for the bound's distance from the estimate.
+# three degrees of freedom do not know, and for the bound's distance from the estimate.
 _PART_OF_TARGET = 0.8
 
 

@@ -159,7 +159,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
     samples, one sample would be left with L F and no knowledge of how light and cosine go together inside the texel. L̄ is therefore the
     mean over the other scrambles of the same half (cross-fitting; Avramidis and Wilson 1993, "A Splitting Scheme for Control Variates"):
     independent of mean_i(f), whose mean is F, so nothing biases the sum, at any number of samples. Where L is constant it is exact (a
-    furnace tests it). Scrambles are no longer quite independent: the covariance of two is the square of one sample's cov(L, f) over 7².
+    furnace tests it). Scrambles are no longer quite independent: the covariance of two is the square of one sample's cov(L, f) over 3².
     """
     ray_bits = ray.view(np.uint32)
     lanes, light = room

@@ -1,7 +1,8 @@
 """Error against run time of our integrator and of installed peers: the same scene, texels and machine, in one run.
 
-The work is radiance in octahedral texels of the spec's probes. Runs of all contestants alternate, each with a seed of its own; of each
-count of samples the median run counts. The error is against a reference of ours, in two independent halves.
+The work is radiance in octahedral texels of the spec's probes, and their irradiance maps, which a peer's texels are convolved to. Runs of
+all contestants alternate, each with a seed of its own; of each count of samples the median run counts. The error is against a reference of
+ours, in two independent halves.
 """
 
 from __future__ import annotations
@@ -16,24 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.atlas import Layout, unpack
 from bake_core.bake import bake
 from bake_core.bench.outcome import Series, error_against_seconds
 from bake_core.bench.peers import Peer, cannot_render, find_peers, running, work
-from bake_core.bundle import Bundle, read_bundle
+from bake_core.bench.reference import EPSILON, Maps, Reference, convolved_maps, read_reference, relative_mse, stored_maps
+from bake_core.bundle import read_bundle
 from bake_core.drawing import Drawing
 from bake_core.environment import Find
-from bake_core.errors import BakeError, InputError
+from bake_core.errors import BakeError
 from bake_core.prepared import prepare
 from bake_core.rate import Rate, in_words, rate_of_runs
 from bake_core.scene_files import load_scene
-from bake_core.spec import SMALLEST_RESOLUTION, Spec, parse_spec
+from bake_core.spec import Spec, parse_spec
 
 F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
-# relMSE = mean((x - r)² / (r² + ε)): what is darker than 0.1 counts as if it were that bright, or one black texel would outweigh all.
-EPSILON = 0.01
 # Probes that the reference is baked for: as many volumes of one probe as a spec may have.
 REFERENCE_PROBES = 64
 
@@ -46,8 +44,8 @@ class Measured:
     ----------
     seconds : float
         Median over the runs, of the bake alone: scene and kernels were ready.
-    relative_mse : float
-        Median over the runs.
+    relative_mse, irradiance_mse : float
+        Median over the runs; of radiance, and of irradiance maps.
     paths_per_second : float
     systematic : float or None
         √ of the part of it that no samples take away: mean((x₁ - A)(x₂ - B) / (r² + ε)) over independent runs x and halves A, B of the
@@ -60,6 +58,7 @@ class Measured:
     samples: int
     seconds: float
     relative_mse: float
+    irradiance_mse: float
     paths_per_second: float
     systematic: float | None
     bias: float
@@ -69,6 +68,11 @@ class Measured:
     def efficiency(self) -> float:
         """RelMSE × seconds: what does not change with the samples where independent ones are all there is. Less is better."""
         return self.relative_mse * self.seconds
+
+    @property
+    def irradiance_efficiency(self) -> float:
+        """The same of irradiance maps."""
+        return self.irradiance_mse * self.seconds
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ class Convergence:
     runs: int
     probes: int
     side: int
+    irradiance_side: int
     reference: str
     reference_noise: float | None
     measured: tuple[Measured, ...]
@@ -105,11 +110,12 @@ class Convergence:
         return {**asdict(self), "rates": {c.name: asdict(self.rate(c.name)) for c in self.contestants}}
 
     def rows(self) -> list[dict[str, Any]]:
-        return [{**asdict(m), "efficiency": m.efficiency} for m in self.measured]
+        return [{**asdict(m), "efficiency": m.efficiency, "irradiance_efficiency": m.irradiance_efficiency} for m in self.measured]
 
     def table(self) -> list[tuple[str, ...]]:
         """Head and rows as people read them."""
-        head: tuple[str, ...] = ("integrator", "samples", "seconds", "M paths/s", "relMSE", "relMSE × s", "bias", "systematic", "rate")
+        head: tuple[str, ...] = ("integrator", "samples", "seconds", "M paths/s", "relMSE", "relMSE × s")
+        head += ("of irradiance", "× s", "bias", "systematic", "rate")
         lines = [head]
         for m in self.measured:
             bias = f"{100 * m.bias:+.3f} %" + ("" if m.bias_error is None else f" ± {100 * m.bias_error:.3f}")
@@ -122,6 +128,8 @@ class Convergence:
                     f"{m.paths_per_second / 1e6:.2f}",
                     f"{m.relative_mse:.2e}",
                     f"{m.efficiency:.2e}",
+                    f"{m.irradiance_mse:.2e}",
+                    f"{m.irradiance_efficiency:.2e}",
                     bias,
                     "–" if m.systematic is None else f"{100 * m.systematic:.2f} %",
                     in_words(self.rate(m.contestant)) if last else "",
@@ -133,7 +141,8 @@ class Convergence:
         noise = "" if self.reference_noise is None else f", its own relMSE {self.reference_noise:.1e}"
         told = [
             f"{self.probes} probes of {self.side}² texels of radiance, medians of {self.runs} alternating runs; relMSE, ε = {EPSILON:g}. "
-            f"Ours makes irradiance maps of {SMALLEST_RESOLUTION}² and finds solids in its seconds, and is read back as stored.",
+            f"Of irradiance: maps of {self.irradiance_side}², over π; peers' are their texels convolved, which costs them no seconds. "
+            "Ours makes both and finds solids in its seconds, and is read back as stored.",
             f"Reference: {self.reference}{noise}.",
         ]
         told += [f"{c.name}: {c.load:.1f} s to load the scene, {c.compile:.1f} s to compile, not counted." for c in self.contestants]
@@ -156,43 +165,14 @@ class _Ours:
         self.render(1, 0)
         self.load, self.compile = self._stages["reading"] + self._stages["building"], self._stages["compiling"]
 
-    def render(self, samples: int, seed: int) -> tuple[F64, float]:
+    def render(self, samples: int, seed: int) -> tuple[Maps, float]:
         stop = self._spec.stop.model_copy(update={"target_error": None, "max_seconds": None, "max_samples": samples})
         # None of the scrambles of one run is that of another: a seed is hashed with all that picks one.
         spec = self._spec.model_copy(update={"stop": stop, "seed": self._spec.seed + seed})
         out = self._folder / "bundle"
         result = bake(self._scene, spec, out, threads=self._threads, find=self._find)
         self._stages = result.run.stages
-        return _radiance(read_bundle(out)), self._stages["tracing"]
-
-
-def _radiance(bundle: Bundle) -> F64:
-    """Every probe's tile, (p, side, side, 3); zero where one has none."""
-    tiles = []
-    for v in bundle.volumes:
-        a, active = v.atlases["radiance"], v.states == 1
-        tiles.append(np.zeros((len(active), a.interior, a.interior, 3)))
-        tiles[-1][active] = unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(active.sum()))
-    return np.concatenate(tiles)
-
-
-@dataclass(frozen=True)
-class _Reference:
-    """`halves` is (1 or 2, n, side, side, 3) of the probes `chosen`."""
-
-    chosen: I64
-    halves: F64
-    words: str
-
-    @property
-    def mean(self) -> F64:
-        return np.asarray(self.halves.mean(0))
-
-    def noise(self) -> float | None:
-        """Its own relMSE, of the mean of both halves: a quarter of their squared difference."""
-        if len(self.halves) < 2:
-            return None
-        return float((((self.halves[0] - self.halves[1]) / 2) ** 2 / (self.mean**2 + EPSILON)).mean())
+        return stored_maps(read_bundle(out)), self._stages["tracing"]
 
 
 def measure(
@@ -217,7 +197,7 @@ def measure(
     reference_samples : int
         Of either half of the reference.
     reference : Path or None
-        An .npz to take it from, or, where there is none, to keep it in: ``chosen`` (n,) and ``halves`` (1 or 2, n, side, side, 3).
+        An .npz to take it from, or, where there is none, to keep it in: :meth:`bake_core.bench.reference.Reference.keep`.
     peers : Path or None
         Where the peers' environments are; see :func:`bake_core.bench.peers.find_peers`.
     say : callable
@@ -228,13 +208,19 @@ def measure(
     OctobakeError
         As bakes do; ``bench.peer_failed``; ``bench.bad_reference``.
     """
-    # Radiance is the work: irradiance is made as small as a spec can have it, and what tells open space from solids takes one more sample.
-    side = prepare(load_scene(scene_path), spec, find).selection.capture
-    small = spec.resolution.model_copy(update={"radiance": side, "irradiance": SMALLEST_RESOLUTION, "distance": side})
-    spec = spec.model_copy(update={"outputs": ("radiance",), "resolution": small})
+    # What tells open space from solids takes as much as one more sample.
+    selection = prepare(load_scene(scene_path), spec, find).selection
+    side, m = selection.capture, selection.irradiance
+    resolution = spec.resolution.model_copy(update={"radiance": side, "irradiance": m, "distance": side})
+    spec = spec.model_copy(update={"outputs": ("irradiance", "radiance"), "resolution": resolution})
     prepared = prepare(load_scene(scene_path), spec.model_copy(update={"integrator": "cache"}), find)
     with tempfile.TemporaryDirectory(prefix="octobake-bench-") as folder, ExitStack() as stack:
-        truth = _reference(scene_path, spec, prepared.volumes, find, threads, reference_samples, reference, side, Path(folder), say)
+        if reference is not None and reference.exists():
+            truth = read_reference(reference, prepared.probe_count, side, m)
+        else:
+            truth = _reference(scene_path, spec, prepared.volumes, find, threads, reference_samples, Path(folder), say)
+            if reference is not None:
+                truth.keep(reference)
         integrators = ("path",) if prepared.light is None else ("path", "cache")
         racing: list[_Ours | Peer] = [_Ours(scene_path, spec, find, threads, Path(folder), i) for i in integrators]
         left_out = []
@@ -252,13 +238,14 @@ def measure(
                 left_out.append((peer.name, e.message))
         if not found:
             say("no peer is installed: ours alone is measured")
-        taken: dict[tuple[int, int], list[tuple[F64, float]]] = {}
+        taken: dict[tuple[int, int], list[tuple[Maps, float]]] = {}
         for run in range(runs):
             for j, count in enumerate(samples):
                 for i, contestant in enumerate(racing):
                     # Far from the reference's seeds, and each its own.
-                    tiles, seconds = contestant.render(count, 1_000_003 * (1 + run) + 101 * j)
-                    taken.setdefault((i, count), []).append((tiles[truth.chosen].astype(np.float64), seconds))
+                    maps, seconds = contestant.render(count, 1_000_003 * (1 + run) + 101 * j)
+                    maps = maps.of(truth.chosen) if isinstance(maps, Maps) else convolved_maps(maps[truth.chosen].astype(np.float64), m)
+                    taken.setdefault((i, count), []).append((maps, seconds))
                     say(f"run {run + 1}/{runs}: {contestant.name}, {count} samples: {seconds:.2f} s")
         measured = tuple(
             _measured(c.name, count, taken[i, count], truth, prepared.probe_count * side**2)
@@ -271,27 +258,37 @@ def measure(
             runs,
             prepared.probe_count,
             side,
+            m,
             truth.words,
             truth.noise(),
             measured,
         )
 
 
-def _measured(name: str, samples: int, runs: list[tuple[F64, float]], truth: _Reference, texels: int) -> Measured:
-    weight = 1 / (truth.mean**2 + EPSILON)
-    errors = [float(((x - truth.mean) ** 2 * weight).mean()) for x, _ in runs]
+def _measured(name: str, samples: int, runs: list[tuple[Maps, float]], truth: Reference, texels: int) -> Measured:
+    mean = truth.mean
+    of_radiance, of_irradiance = ([relative_mse(maps[i], mean[i]) for maps, _ in runs] for i in range(2))
     seconds = float(np.median([s for _, s in runs]))
-    level = float(truth.mean.mean())
-    means = [float(x.mean()) / level - 1 for x, _ in runs]
+    level = float(mean.radiance.mean())
+    means = [float(maps.radiance.mean()) / level - 1 for maps, _ in runs]
     systematic = bias_error = None
-    if len(runs) > 1 and len(truth.halves) > 1:
-        a, b = truth.halves
-        products = [((x - a) * (y - b) * weight).mean() for i, (x, _) in enumerate(runs) for j, (y, _) in enumerate(runs) if i != j]
+    if len(runs) > 1 and len(truth.halves.radiance) > 1:
+        a, b = truth.halves.radiance
+        found, weight = [maps.radiance for maps, _ in runs], 1 / (mean.radiance**2 + EPSILON)
+        products = [((x - a) * (y - b) * weight).mean() for i, x in enumerate(found) for j, y in enumerate(found) if i != j]
         systematic = max(float(np.mean(products)), 0.0) ** 0.5
-        halves = float(np.ptp([h.mean() for h in truth.halves])) / 2 / level
+        halves = float(np.ptp([h.mean() for h in truth.halves.radiance])) / 2 / level
         bias_error = float(np.hypot(np.std(means, ddof=1) / len(runs) ** 0.5, halves))
     return Measured(
-        name, samples, seconds, float(np.median(errors)), texels * samples / seconds, systematic, float(np.mean(means)), bias_error
+        name,
+        samples,
+        seconds,
+        float(np.median(of_radiance)),
+        float(np.median(of_irradiance)),
+        texels * samples / seconds,
+        systematic,
+        float(np.mean(means)),
+        bias_error,
     )
 
 
@@ -302,13 +299,9 @@ def _reference(
     find: Find,
     threads: int,
     samples: int,
-    path: Path | None,
-    side: int,
     folder: Path,
     say: Callable[[str], None],
-) -> _Reference:
-    if path is not None and path.exists():
-        return _read_reference(path, sum(v.probe_count for v in volumes), side)
+) -> Reference:
     everywhere = np.concatenate([v.positions() for v in volumes])
     cells = np.concatenate([np.tile(v.spacing, (v.probe_count, 1)) for v in volumes])
     chosen = np.unique(np.linspace(0, len(everywhere) - 1, min(REFERENCE_PROBES, len(everywhere))).round().astype(np.int64))
@@ -320,26 +313,10 @@ def _reference(
     renderer = _Ours(scene, few, find, threads, folder)
     halves = []
     for half in range(2):
-        tiles, seconds = renderer.render(samples, 500_009 * (half + 1))
-        halves.append(tiles)
+        maps, seconds = renderer.render(samples, 500_009 * (half + 1))
+        halves.append(maps)
         say(f"reference {half + 1}/2: {len(chosen)} probes, {samples} samples: {seconds:.1f} s")
     # A probe inside a solid has no light to be wrong about.
     active = np.concatenate([v.states for v in read_bundle(folder / "bundle").volumes]) == 1
-    made = _Reference(chosen[active], np.stack(halves)[:, active], f"ours, path traced, two of {samples} samples at {active.sum()} probes")
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, chosen=made.chosen, halves=made.halves.astype(np.float32))
-    return made
-
-
-def _read_reference(path: Path, probes: int, side: int) -> _Reference:
-    what = f"must be an .npz with chosen (n,) below {probes} and halves (1 or 2, n, {side}, {side}, 3); delete it to have it made anew"
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            chosen, halves = stored["chosen"].astype(np.int64), stored["halves"].astype(np.float64)
-    except (OSError, ValueError, KeyError) as e:
-        raise InputError("bench.bad_reference", what, str(path)) from e
-    right = chosen.ndim == 1 and len(chosen) and chosen.min() >= 0 and chosen.max() < probes and np.isfinite(halves).all()
-    if not right or len(halves) not in (1, 2) or halves.shape[1:] != (len(chosen), side, side, 3):
-        raise InputError("bench.bad_reference", what, str(path))
-    return _Reference(chosen, halves, f"{path.name}, {len(halves)} runs at {len(chosen)} probes")
+    both = Maps(*(np.stack(maps)[:, active] for maps in zip(*halves, strict=True)))
+    return Reference(chosen[active], both, f"ours, path traced, two of {samples} samples at {active.sum()} probes")

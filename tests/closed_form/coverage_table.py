@@ -130,7 +130,7 @@ SCENES: tuple[tuple[str, Callable[[Path], Prepared], float], ...] = (
     ("a Cornell box", _cornell, 0.015),
     (CACHED, _cached, 0.007),
     ("two rooms, one of them dark", _rooms, 0.003),
-    ("a pavilion: textures, gloss, cut-outs, sun and sky", _pavilion, 0.02),
+    ("a pavilion: textures, gloss, cut-outs, sun and sky", _pavilion, 0.016),
     ("a Cornell box under a sky, three bounces", _courtyard, 0.008),
 )
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from bake_core.bench import pairs, peers
-from bake_core.bench.convergence import EPSILON, _radiance
 from bake_core.bench.outcome import Series, error_against_seconds, put_section
+from bake_core.bench.reference import EPSILON, convolved_maps, stored_maps
 from bake_core.bench.targets import audited_in_words
 from bake_core.drawing import as_svg
 from bake_core.examples import closed_box, cornell, plane_under_sun, square_emitter
+from bake_core.octahedral import texel_directions, texel_solid_angles
 from bake_core.prepared import prepare
 from bake_core.rate import rate_of_runs
 from bake_core.scene_files import load_scene
@@ -99,12 +100,13 @@ def test_convergence_without_peers(scene: Path, capsys: pytest.CaptureFixture[st
     assert [(r["contestant"], r["samples"]) for r in rows] == raced
     first, second, *_ = document["measured"]
     assert second["relative_mse"] < first["relative_mse"] and abs(second["bias"]) < 4 * second["bias_error"] + 1e-3
+    assert second["irradiance_mse"] < first["irradiance_mse"] < first["relative_mse"]
     assert document["probes"] == 4 and document["reference_noise"] < second["relative_mse"]
     assert printed.splitlines()[0].startswith("integrator") and "Reference: ours, path traced" in printed
     # Again, from the reference that was kept.
     assert not bench("convergence", scene, *options).joinpath("tiles.npy").exists()
     assert "Reference: reference.npz, 2 runs at 4 probes" in capsys.readouterr().out
-    np.savez(kept, chosen=np.array([9]), halves=np.zeros((2, 1, 16, 16, 3)))
+    np.savez(kept, chosen=np.array([9]), radiance=np.zeros((2, 1, 16, 16, 3)), irradiance=np.zeros((2, 1, 8, 8, 3)))
     assert main(["bench", "convergence", str(scene), "--spec", str(scene.parent), "-o", str(out), "--reference", str(kept)]) == 2
     assert "bench.bad_reference" in capsys.readouterr().err
 
@@ -150,15 +152,28 @@ def test_what_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_every_probe_has_its_own_tile(tmp_path: Path) -> None:
     """Those inside solids have none in the bundle; what comes after them stays where it belongs."""
-    bundle = bake_example(tmp_path, cornell(), stop={"target_error": None, "max_samples": 1}, outputs=["radiance"])
-    (volume,), tiles = bundle.volumes, _radiance(bundle)
+    bundle = bake_example(tmp_path, cornell(), stop={"target_error": None, "max_samples": 1}, outputs=["irradiance", "radiance"])
+    (volume,), (tiles, irradiance) = bundle.volumes, stored_maps(bundle)
     assert len(tiles) == len(volume.states) > (volume.states == 1).sum()
-    np.testing.assert_array_equal(tiles.reshape(len(tiles), -1).any(1), volume.states == 1)
+    for maps in (tiles, irradiance):
+        np.testing.assert_array_equal(maps.reshape(len(maps), -1).any(1), volume.states == 1)
     last = np.flatnonzero(volume.states == 1)[-1]
     tile, (row, column) = volume.atlases["radiance"].tile, np.divmod((volume.states == 1).sum() - 1, volume.atlases["radiance"].columns)
     layer, row = np.divmod(row, volume.atlases["radiance"].rows)
     stored = volume.atlases["radiance"].texels[layer, row * tile + 1 : (row + 1) * tile - 1, column * tile + 1 : (column + 1) * tile - 1]
     np.testing.assert_array_equal(tiles[last], stored)
+
+
+def test_a_peer_s_texels_convolved_are_irradiance() -> None:
+    """Of all directions alike it is as bright over π; of one texel, its part of the sphere by the cosine."""
+    side, m = 16, 8
+    radiance = np.zeros((2, side, side, 3))
+    radiance[0], radiance[1, 3, 5] = 2.0, 1.0
+    even, single = convolved_maps(radiance, m).irradiance
+    np.testing.assert_allclose(even, 2.0, rtol=1e-12)
+    toward, normals = texel_directions(side)[3, 5], texel_directions(m)
+    solid_angle = texel_solid_angles(side)[3, 5]
+    np.testing.assert_allclose(single[..., 0], np.maximum(normals @ toward, 0) * solid_angle / np.pi, atol=0.02 * solid_angle)
 
 
 def test_when_a_curve_gets_there() -> None:

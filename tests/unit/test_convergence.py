@@ -36,7 +36,7 @@ def test_passes_double(most: int, ends: list[int]) -> None:
     ("samples", "error", "end"),
     [
         (64, None, 128),
-        (64, 0.021, 80),  # 1.1 times as many: an eighth of 64, but no less than a round of scrambles
+        (64, 0.021, 72),  # 1.1 times as many: an eighth of 64, which is a round of scrambles
         (64, 0.024, 96),  # 1.44
         (64, 0.04, 128),  # four times: doubled, and looked at again
         (256, 0.0201, 288),
@@ -54,7 +54,8 @@ def test_a_pass_is_shortened_to_the_time_that_is_left() -> None:
     assert fit_pass(stop, (32, 64), curve, 4.0) == (32, 64)
     assert fit_pass(stop, (32, 64), curve, 8.0) == (32, 48)
     assert fit_pass(stop, (32, 64), curve, 7.9) == (32, 48)  # whole rounds of scrambles
-    assert fit_pass(stop, (32, 64), curve, 8.1) == (32, 32)
+    assert fit_pass(stop, (32, 64), curve, 8.1) == (32, 40)
+    assert fit_pass(stop, (32, 64), curve, 9.1) == (32, 32)
     assert fit_pass(stop, (32, 64), curve, 1e9) == (32, 32)
 
 
@@ -138,7 +139,7 @@ def coverage(probes: int, correlated: bool, samples: int, sigma: Array, trials: 
 def test_the_bound_holds_95_times_out_of_100(probes: int, samples: int, loosest: float) -> None:
     """Where a probe's texels err alike: not less, not much more either. Of many probes the mean is well known, and the bound tight."""
     held, ratio = coverage(probes, True, samples, np.full((probes, 1, 1, 1), 0.4))
-    assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 600) < held < 0.985
+    assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 600) < held < 0.99
     assert ratio < loosest
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.allocation import Allocation
+from bake_core.allocation import SCRAMBLES, Allocation
 from bake_core.bake import empty_state
 from bake_core.cache_cells import codes
 from bake_core.cache_points import Points
@@ -182,7 +182,7 @@ def test_a_large_bake_holds_no_more_points_than_it_may() -> None:
         large = replace(light, positions=np.zeros((probes, 3)), units=np.ones(probes), texels=texels)
         assert large.bytes(1 << 20) < 1.2e9
         for stage in range(8):
-            assert large.rounds(stage) * large.paths(stage) == texels // 2 << stage
+            assert large.rounds(stage) * large.paths(stage) * SCRAMBLES == 8 * texels << stage
 
 
 # --- when it is used ---------------------------------------------------------------------------------------------------------------

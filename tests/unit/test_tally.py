@@ -123,7 +123,7 @@ def test_what_a_pass_adds() -> None:
     assert (state.allocation.eighths[~kept] == 0).all() and (state.allocation.eighths[kept] == FULL).all()
 
 
-@pytest.mark.parametrize("samples", [1, 2, 15])
+@pytest.mark.parametrize("samples", [1, 2, SCRAMBLES - 1])
 def test_with_fewer_samples_than_scrambles_there_is_no_error(samples: int) -> None:
     state = empty()
     state.add([tally((0, PROBES), (0, samples))])
@@ -144,8 +144,8 @@ def test_inactive_probes_do_not_count() -> None:
 def test_halves_count_alike_whatever_their_numbers_of_samples() -> None:
     """One half had 16 samples of 1, the other 8 of 4: no number of samples may have a say in the mean."""
     state = replace(empty(), samples=32, taken=np.tile([[16, 8]], (PROBES, 1)))
-    state.irradiance[:, :SCRAMBLES_PER_HALF] = 2 * 1.0
-    state.irradiance[:, SCRAMBLES_PER_HALF:] = 1 * 4.0
+    state.irradiance[:, :SCRAMBLES_PER_HALF] = 16 / SCRAMBLES_PER_HALF * 1.0
+    state.irradiance[:, SCRAMBLES_PER_HALF:] = 8 / SCRAMBLES_PER_HALF * 4.0
     state.radiance[:, 0], state.radiance[:, 1] = 16 * 1.0, 8 * 4.0
     np.testing.assert_array_equal(state.mean(), 2.5)
     np.testing.assert_array_equal(state.mean(slice(1, 3)), np.full((2, TEXELS, 3), 2.5))
