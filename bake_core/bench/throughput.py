@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import SCRAMBLES, uniform
+from bake_core.allocation import uniform
 from bake_core.bench.outcome import Series, curves
 from bake_core.bench.targets import Subject
 from bake_core.capture import Capture, capture_radiance
+from bake_core.convergence import FIRST_SAMPLES
 from bake_core.drawing import Drawing
 from bake_core.environment import beside
 from bake_core.prepared import Prepared, prepare
@@ -24,8 +25,8 @@ from bake_core.tracer import Tracer
 
 I64 = NDArray[np.int64]
 
-# Of each probe: one of every scramble, so that a path costs what it costs in a bake.
-SAMPLES = SCRAMBLES
+# Of each probe: a bake's first pass, so that a path costs what it costs in one.
+SAMPLES = FIRST_SAMPLES
 # What is written down: some 160 MB, and a second or two of tracing.
 _MOST_RAYS = 4_000_000
 # A ray's share of them is guessed from so many probes.
@@ -189,7 +190,7 @@ def logging_tracer(tracer: Tracer, log: RayLog) -> Tracer:
 
 
 def trace_once(prepared: Prepared, tracer: Tracer, probes: I64, threads: int) -> None:
-    """One path of every scramble through every capture texel of some probes (n,), as a bake's first pass traces them."""
+    """A bake's first pass: its paths through every capture texel of some probes (n,)."""
     selection, spec = prepared.selection, prepared.spec
     capture_radiance(
         tracer,

@@ -84,8 +84,9 @@ def test_a_screen_lets_a_quarter_of_the_sun_through(tmp_path: Path, kind: str) -
     square(w, "floor", FLOOR * 300, w.material("floor", (0.5, 0.5, 0.5)))
     material, more = screen(w, kind)
     square(w, "screen", FLOOR * 400 + [0, 1, 0], material, 4000, **more)
-    spec = probe([0.1, 0.5, 0.1], lights=[{"kind": "directional", "direction": [0, -1, 0], "irradiance": [3, 3, 3]}])
-    texels = bake(tmp_path, w, spec)
+    sun = {"kind": "directional", "direction": [0, -1, 0], "irradiance": [3, 3, 3]}
+    # Of the quarter that one in four rays makes, 200,000 of them know 0.4 %.
+    texels = bake(tmp_path, w, probe([0.1, 0.5, 0.1], lights=[sun], stop={"target_error": None, "max_samples": 2048}))
     down = texel_directions(8).reshape(-1, 3)[:, 1]
     worst = int(np.argmin(down))
     assert texels.reshape(-1, 3)[worst] == pytest.approx([0.5 * 3 / 4 * (1 - down[worst]) / 2] * 3, rel=0.015)

@@ -180,7 +180,7 @@ def test_the_curve_has_a_point_for_each_doubling_and_errors_fall(tmp_path: Path)
     assert {k: result.manifest["error"][k] for k in ("value", "target", "scrambles")} == {
         "value": errors[-1],
         "target": None,
-        "scrambles": 16,
+        "scrambles": 8,
     }
     report = read_report(tmp_path / "out")
     assert report is not None
