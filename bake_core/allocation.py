@@ -28,8 +28,9 @@ I64 = NDArray[np.int64]
 HALVES = 2
 SCRAMBLES_PER_HALF = 4
 SCRAMBLES = HALVES * SCRAMBLES_PER_HALF
-# The first two passes are everybody's.
-PILOT_SAMPLES = 4 * SCRAMBLES
+# The first pass; each later one doubles the samples. The first two are everybody's.
+FIRST_SAMPLES = 16
+PILOT_SAMPLES = 2 * FIRST_SAMPLES
 # Densities are counted in eighths; the least is one, so that a probe that saw nothing of a rare light in the pilot looks again.
 FULL = 8
 # How much of the target may be spent on sampling easy probes less, if the sample limit is to be enough all the same. The rest is for what

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.atlas import Layout, unpack
 from bake_core.bake import check_finite, compile_kernels, finish, gather
 from bake_core.bundle import VolumeData, read_bundle
 from bake_core.clock import Clock
@@ -101,7 +100,6 @@ def _digests(volumes: Sequence[VolumeData], kept: Sequence[NDArray[np.bool_]]) -
     out = {}
     for volume, some in zip(volumes, kept, strict=True):
         active = volume.states == 1
-        for a in volume.atlases.values():
-            maps = unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(active.sum()))
-            out[f"{volume.name}.{a.output}"] = sha256(maps[some[active]].tobytes()).hexdigest()
+        for output in volume.atlases:
+            out[f"{volume.name}.{output}"] = sha256(volume.maps(output)[some[active]].tobytes()).hexdigest()
     return out

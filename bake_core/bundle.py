@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core import strict_json
+from bake_core.atlas import Layout, unpack
 from bake_core.errors import BundleError
 from bake_core.images import read_exr
 
@@ -96,6 +97,11 @@ class VolumeData:
         """(n,) int64: each probe's tile in all atlases, -1 for one that has none. Tiles follow flat order."""
         kept = self.states == 1
         return np.where(kept, np.cumsum(kept) - 1, -1)
+
+    def maps(self, output: str) -> F32:
+        """Its active probes' maps, in flat order and without borders, (k, t, t, channels) float32."""
+        a = self.atlases[output]
+        return unpack(a.texels, Layout(a.columns, a.rows, a.layers), int((self.states == 1).sum()))
 
     def positions(self) -> F64:
         """Where the probes stand, offsets included: (n, 3) float64, world, in flat order."""

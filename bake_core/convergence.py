@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF
+from bake_core.allocation import FIRST_SAMPLES, HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.spec import Stop
 
 F64 = NDArray[np.float64]
@@ -26,8 +26,6 @@ I64 = NDArray[np.int64]
 DARK_FRACTION = 0.05
 # One-sided 95 % point of the normal distribution.
 _Z95 = 1.6448536269514722
-# The first pass; each later one doubles the samples.
-FIRST_SAMPLES = 16
 # A pass that is shortened is a multiple of this: each scramble gets as many samples.
 SMALLEST_PASS = SCRAMBLES
 _PROBES_AT_ONCE = 512

@@ -26,7 +26,7 @@ from bake_core.assemble import assemble
 from bake_core.cubemaps import FACES, cube_directions, octahedral_radiance, octahedral_surfaces
 from bake_core.errors import InputError, MachineError
 from bake_core.images import read_exr
-from bake_core.octahedral import texel_cosines, texel_directions
+from bake_core.octahedral import convolved
 from bake_core.placement import Volume
 from bake_core.report import Run
 from bake_core.selection import Selection, visibility_sides
@@ -206,12 +206,11 @@ def _read_face(path: Path, channels: int, digest: Any) -> F32:
 def _fill(state: State, at: int, volume: Volume, spec: Spec, radiance: int, light: F32, distances: F64) -> None:
     """One probe's maps, as a bake's passes leave them: sums of one sample of either half."""
     r = spec.resolution
-    texels = octahedral_radiance(light[None], radiance)[0].reshape(-1, 3)
-    cosines = texel_cosines(radiance, texel_directions(r.irradiance).reshape(-1, 3))
-    irradiance = np.array([(row[:, None] * texels).sum(0) for row in cosines])
+    texels = octahedral_radiance(light[None], radiance)[0]
+    irradiance = convolved(texels, r.irradiance)
     for half in range(HALVES):
-        state.radiance[at, half] = texels
-        state.irradiance[at, half * SCRAMBLES_PER_HALF] = irradiance
+        state.radiance[at, half] = texels.reshape(-1, 3)
+        state.irradiance[at, half * SCRAMBLES_PER_HALF] = irradiance.reshape(-1, 3)
     distance, normal = octahedral_surfaces(distances[None], r.distance)
     state.distance[at] = distance[0]
     state.normal[at] = normal[0] if r.normal == r.distance else octahedral_surfaces(distances[None], r.normal)[1][0]

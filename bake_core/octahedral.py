@@ -179,6 +179,25 @@ def texel_cosines(n: int, normals: F64) -> F64:
     return out
 
 
+def convolved(radiance: NDArray[np.floating], m: int) -> F64:
+    """Irradiance, no 1/π inside, from radiance that is the same all over each texel.
+
+    Parameters
+    ----------
+    radiance : (..., n, n, c) float
+
+    Returns
+    -------
+    (..., m, m, c) float64
+    """
+    *probes, n, _, channels = radiance.shape
+    texels = radiance.reshape(*probes, n * n, channels)
+    rows = texel_cosines(n, texel_directions(m).reshape(-1, 3))
+    # No matrix product: its sums are others on another machine.
+    sums = [(row[:, None] * texels).sum(-2) for row in rows]
+    return np.stack(sums, -2).reshape(*probes, m, m, channels)
+
+
 def _arc(u: F64, v: F64, normal: F64) -> F64:
     """Length of the arc from u to v times the cosine between its plane's normal and `normal`."""
     plane = np.cross(u, v)

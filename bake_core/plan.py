@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import PILOT_SAMPLES, SCRAMBLES, Allocation
+from bake_core.allocation import FIRST_SAMPLES, PILOT_SAMPLES, SCRAMBLES, Allocation
 from bake_core.bake import check_finite, compile_kernels, empty_state
 from bake_core.convergence import decide, error_bound, f95, next_pass
 from bake_core.environment import Find, no_images
@@ -245,7 +245,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     light = prepared.light and prepared.light.of_some(_LEARNING_PROBES)
     few = replace(prepared, **part, light=light)
     state, start = empty_state(few), Allocation.start(count)
-    first, second = (0, PILOT_SAMPLES // 2), (PILOT_SAMPLES // 2, PILOT_SAMPLES)
+    first, second = (0, FIRST_SAMPLES), (FIRST_SAMPLES, PILOT_SAMPLES)
     # No sample at all: distances alone.
     looked, looking = _timed(lambda: trace_shard(few, (0, count), (0, 0), start, threads=threads))
     alone = [trace_shard(few, (probe, probe + 1), first, start, threads=threads) for probe in range(count)]

@@ -10,10 +10,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import HALVES, SCRAMBLES
+from bake_core.allocation import FIRST_SAMPLES, HALVES, SCRAMBLES
 from bake_core.cache_cells import FEWEST, average, codes
 from bake_core.cache_points import Points, find_points, gather_light
-from bake_core.convergence import FIRST_SAMPLES
 from bake_core.light_cache import AXIS_CELLS, LightCache, empty_cache
 from bake_core.spec import Spec
 from bake_core.tracer import Tracer

@@ -175,6 +175,18 @@ class _Ours:
         return stored_maps(read_bundle(out)), self._stages["tracing"]
 
 
+class _Theirs:
+    """A peer, whose texels of radiance are all that it says of irradiance in m × m directions."""
+
+    def __init__(self, peer: Peer, m: int) -> None:
+        self._peer, self._m = peer, m
+        self.name, self.load, self.compile = peer.name, peer.load, peer.compile
+
+    def render(self, samples: int, seed: int) -> tuple[Maps, float]:
+        tiles, seconds = self._peer.render(samples, seed)
+        return convolved_maps(tiles.astype(np.float64), self._m), seconds
+
+
 def measure(
     scene_path: Path,
     spec: Spec,
@@ -222,7 +234,7 @@ def measure(
             if reference is not None:
                 truth.keep(reference)
         integrators = ("path",) if prepared.light is None else ("path", "cache")
-        racing: list[_Ours | Peer] = [_Ours(scene_path, spec, find, threads, Path(folder), i) for i in integrators]
+        racing: list[_Ours | _Theirs] = [_Ours(scene_path, spec, find, threads, Path(folder), i) for i in integrators]
         left_out = []
         given: dict[str, Any] | None = None
         found = find_peers(peers)
@@ -233,7 +245,7 @@ def measure(
                 continue
             given = given or work(prepared, threads)
             try:
-                racing.append(stack.enter_context(running(peer, given, Path(folder))))
+                racing.append(_Theirs(stack.enter_context(running(peer, given, Path(folder))), m))
             except BakeError as e:
                 left_out.append((peer.name, e.message))
         if not found:
@@ -244,8 +256,7 @@ def measure(
                 for i, contestant in enumerate(racing):
                     # Far from the reference's seeds, and each its own.
                     maps, seconds = contestant.render(count, 1_000_003 * (1 + run) + 101 * j)
-                    maps = maps.of(truth.chosen) if isinstance(maps, Maps) else convolved_maps(maps[truth.chosen].astype(np.float64), m)
-                    taken.setdefault((i, count), []).append((maps, seconds))
+                    taken.setdefault((i, count), []).append((maps.of(truth.chosen), seconds))
                     say(f"run {run + 1}/{runs}: {contestant.name}, {count} samples: {seconds:.2f} s")
         measured = tuple(
             _measured(c.name, count, taken[i, count], truth, prepared.probe_count * side**2)

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.atlas import Layout, unpack
 from bake_core.bundle import Bundle
 from bake_core.errors import InputError
-from bake_core.octahedral import texel_cosines, texel_directions
+from bake_core.octahedral import convolved
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -36,7 +35,7 @@ class Maps(NamedTuple):
 
     def of(self, chosen: I64) -> Maps:
         """Of some of its probes."""
-        return Maps(*(maps[chosen].astype(np.float64) for maps in self))
+        return Maps(*(maps[chosen] for maps in self))
 
 
 def stored_maps(bundle: Bundle) -> Maps:
@@ -45,19 +44,16 @@ def stored_maps(bundle: Bundle) -> Maps:
     for output, scale in (("radiance", 1.0), ("irradiance", np.pi)):
         tiles = []
         for v in bundle.volumes:
-            a, active = v.atlases[output], v.states == 1
-            tiles.append(np.zeros((len(active), a.interior, a.interior, 3)))
-            tiles[-1][active] = unpack(a.texels, Layout(a.columns, a.rows, a.layers), int(active.sum())) / scale
+            maps = v.maps(output)
+            tiles.append(np.zeros((len(v.states), *maps.shape[1:])))
+            tiles[-1][v.states == 1] = maps / scale
         found.append(np.concatenate(tiles))
     return Maps(*found)
 
 
 def convolved_maps(radiance: F64, m: int) -> Maps:
     """What texels of radiance say of irradiance in m × m directions: each one's mean times the cosine's exact integral over it."""
-    n, side = radiance.shape[:2]
-    cosines = texel_cosines(side, texel_directions(m).reshape(-1, 3))
-    irradiance = np.einsum("ij,njc->nic", cosines, radiance.reshape(n, side * side, 3)) / np.pi
-    return Maps(radiance, irradiance.reshape(n, m, m, 3))
+    return Maps(radiance, convolved(radiance, m) / np.pi)
 
 
 @dataclass(frozen=True)
@@ -73,11 +69,8 @@ class Reference:
         return Maps(*(np.asarray(half.mean(0)) for half in self.halves))
 
     def noise(self) -> float | None:
-        """Its own relMSE of radiance, of the mean of both halves: a quarter of their squared difference."""
-        if len(self.halves.radiance) < 2:
-            return None
-        a, b = self.halves.radiance
-        return relative_mse(a / 2, b / 2, self.mean.radiance)
+        """Its own relMSE of radiance: either half is as far from their mean as that, in the mean, is from the truth."""
+        return relative_mse(self.halves.radiance[0], self.mean.radiance) if len(self.halves.radiance) > 1 else None
 
     def keep(self, path: Path) -> None:
         """Into an .npz that :func:`read_reference` takes."""
@@ -86,9 +79,9 @@ class Reference:
         np.savez(path, chosen=self.chosen, radiance=radiance, irradiance=irradiance)
 
 
-def relative_mse(found: F64, truth: F64, scale: F64 | None = None) -> float:
-    """Mean of (x - r)² / (s² + ε); s is r where it is not given."""
-    return float(((found - truth) ** 2 / ((truth if scale is None else scale) ** 2 + EPSILON)).mean())
+def relative_mse(found: F64, truth: F64) -> float:
+    """Mean of (x - r)² / (r² + ε)."""
+    return float(((found - truth) ** 2 / (truth**2 + EPSILON)).mean())
 
 
 def read_reference(path: Path, probes: int, side: int, m: int) -> Reference:

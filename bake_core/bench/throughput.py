@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import uniform
+from bake_core.allocation import FIRST_SAMPLES, uniform
 from bake_core.bench.outcome import Series, curves
 from bake_core.bench.targets import Subject
 from bake_core.capture import Capture, capture_radiance
-from bake_core.convergence import FIRST_SAMPLES
 from bake_core.drawing import Drawing
 from bake_core.environment import beside
 from bake_core.prepared import Prepared, prepare

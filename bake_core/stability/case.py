@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.atlas import Layout, unpack
 from bake_core.bake import bake
 from bake_core.bundle import Bundle, read_bundle
 from bake_core.environment import beside
@@ -94,9 +93,7 @@ class Case:
 
 def maps(bundle: Bundle, output: str = "irradiance", volume: int = 0) -> F64:
     """The map of every probe outside solids, in flat order, without borders: (n, t, t, channels)."""
-    v = bundle.volumes[volume]
-    a = v.atlases[output]
-    return unpack(a.texels, Layout(a.columns, a.rows, a.layers), int((v.states == 1).sum())).astype(np.float64)
+    return bundle.volumes[volume].maps(output).astype(np.float64)
 
 
 def near(expected: float, found: F64, relative: float, note: str) -> Result:

@@ -124,11 +124,10 @@ def _courtyard(folder: Path) -> Prepared:
     return _example(folder, glb, {"volumes": [GRID], "environment": environment, "max_bounces": 3, "integrator": "path"})
 
 
-CACHED = "a Cornell box, light cache"
 # Name, scene, target.
 SCENES: tuple[tuple[str, Callable[[Path], Prepared], float], ...] = (
     ("a Cornell box", _cornell, 0.015),
-    (CACHED, _cached, 0.007),
+    ("a Cornell box, light cache", _cached, 0.007),
     ("two rooms, one of them dark", _rooms, 0.003),
     ("a pavilion: textures, gloss, cut-outs, sun and sky", _pavilion, 0.016),
     ("a Cornell box under a sky, three bounces", _courtyard, 0.008),

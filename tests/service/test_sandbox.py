@@ -132,7 +132,7 @@ def test_an_answer_that_is_no_outline_calls_nothing() -> None:
 
 
 def test_scenes_of_many_nodes_are_not_kept_by_the_dozen(service: Service) -> None:
-    """A hundred bytes and more a node: 64 scenes of a million would be gigabytes. One that alone is too large is read each time."""
+    """450 bytes a node: 64 scenes of a million would be 29 GB. One that alone is too large is read each time."""
     asked: list[str] = []
 
     def call(_: str, root: str, *__: object, **___: object) -> tuple[SimpleNamespace, dict[str, object]]:
