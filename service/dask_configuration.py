@@ -24,6 +24,10 @@ _CONFIGURATION: dict[str, Any] = {
     "distributed.admin.system-monitor.log-length": 10,
     "distributed.diagnostics.computations.max-history": 1,
     "distributed.diagnostics.erred-tasks.max-history": 1,
+    # How late its event loops are it would measure fifty times a second in each of three, and how busy the process is twice: more than half
+    # of what an idle service takes of a core.
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
     "distributed.comm.timeouts.connect": "10s",
 }
 

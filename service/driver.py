@@ -85,6 +85,9 @@ class Driver:
         # A restart may have come between the request and its effect.
         self._enough = job.stop_asked
         self._tracing = False
+        # Futures that are done with. They are released behind the next piece's submission: what follows a message within ten milliseconds
+        # Dask's client sends only after those, and the worker would wait for its next piece.
+        self._spent: list[Future[Any]] = []
         self._shown: dict[str, Any] | None = None
 
     # Called from other threads
@@ -134,6 +137,7 @@ class Driver:
             log.exception("job %s", job)
             self._fail(BakeError("bake.internal", f"{type(e).__name__}: {e}", f"job {job}"))
         finally:
+            self._release()
             self._hub.forget(job)
             self._hub.tell(job)
         self._blobs.remove_work(job)
@@ -291,6 +295,7 @@ class Driver:
                 future = self._compute.submit(piece.function, *piece.arguments)
                 running[str(future.key)] = piece, future
                 future.add_done_callback(lambda done: self._inbox.put(str(done.key)))
+            self._release()
             try:
                 news = self._inbox.get(timeout=held or None)
             except queue.Empty:
@@ -316,7 +321,7 @@ class Driver:
                 else:
                     advance(max(0.0, 1.0 - piece.told))
                 finally:
-                    self._compute.release(future)
+                    self._spent.append(future)
             elif news["key"] in running:
                 begun[news["key"]] = news["address"]
                 if "progress" in news:
@@ -326,6 +331,10 @@ class Driver:
                     # A piece that is run again has told a part of this already.
                     advance(max(0.0, news["done"] - piece.told))
                     piece.told = max(piece.told, news["done"])
+
+    def _release(self) -> None:
+        while self._spent:
+            self._compute.release(self._spent.pop())
 
     def _halt(self, running: dict[str, tuple[_Piece, Future[Any]]], begun: dict[str, str], wait: bool) -> None:
         """Stop what runs, and see to it that it has stopped."""

@@ -35,7 +35,7 @@ from bake_core.preview import preview
 from bake_core.progress import Progress
 from bake_core.relocation_trial import Trial
 from bake_core.report import Run
-from bake_core.shards import trace_shard
+from bake_core.shards import lit, trace_shard
 from bake_core.spec import parse_spec
 from bake_core.tally import State, Tally
 from bake_core.thresholds import parse_thresholds
@@ -120,11 +120,13 @@ def compile_kernels(work: Work) -> None:
 
 
 def trace(work: Work, name: str, probes: tuple[int, int], samples: tuple[int, int], allocation: str | None) -> tuple[str, float]:
-    """One shard of one pass; answers where its sums are stored and the seconds it took."""
+    """One shard of one pass; answers where its sums are stored and the seconds that tracing took."""
     with _task(work) as task:
         prepared = _prepared(work)
         blobs = _blobs(work.store)
         given = Allocation.from_bytes(blobs.get_work(work.job, allocation)) if allocation else Allocation.start(prepared.probe_count)
+        # What a pass learns first is learnt once, and tells nothing of how long the next shard will take.
+        lit(prepared, samples, threads=work.own_threads, cancelled=task.flag)
         began = time.monotonic()
         tally = trace_shard(prepared, probes, samples, given, threads=work.own_threads, cancelled=task.flag, advance=task.advance)
         seconds = time.monotonic() - began

@@ -9,6 +9,6 @@ from tests.service.figures.table import Say
 
 
 def measure(seconds: float, rounds: int, say: Say) -> None:
-    """Medians of the wall time from the command, or the request, to the bundle in a file."""
+    """Ratio of the wall times from the command, or the request, to the bundle in a file."""
     found = bench_service.measure(seconds, rounds, lambda line: print(line, flush=True))
-    say(f"service over octobake bake of {statistics.median(found.alone):.1f} s, medians of {rounds}", 100 * found.overhead, 3.0, "%")
+    say(f"service over octobake bake of {statistics.median(found.alone):.1f} s, median of {rounds} pairs", 100 * found.overhead, 3.0, "%")
