@@ -248,5 +248,17 @@ def many_lamps(emitters: int) -> Example:
     return w.to_glb(), {"version": 1, "volumes": [_MIDDLE]}
 
 
+def lamp_corridor(lamps: int) -> Example:
+    """A closed corridor, 2 × 2 m and 2 m long for each of its lamps: most light up another part of it than the one that asks."""
+    length = 2.0 * lamps
+    glows = [_horizontal((-0.1, 0.1), (z - 0.1, z + 0.1), 1.98, up=False) for z in np.arange(1.0, length, 2.0)]
+    w = GlbWriter()
+    white = w.material("white", (0.7, 0.7, 0.7))
+    lamp = w.material("lamp", (0.0, 0.0, 0.0), emission=(20.0, 20.0, 20.0))
+    w.node("corridor", mesh=w.mesh("corridor", [quads_part(box_sides((-1, 0, 0), (1, 2, length)), white), quads_part(glows, lamp)]))
+    grid = {"name": "corridor", "origin": [-0.4, 0.5, 1.0], "spacing": [0.8, 0.5, length / 16], "counts": [2, 3, 16]}
+    return w.to_glb(), {"version": 1, "volumes": [grid]}
+
+
 # One probe in the middle of a room of 2 m.
 _MIDDLE = {"name": "room", "origin": [0.1, 0.9, -0.1], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}

@@ -135,15 +135,15 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
     )
 
 
-def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
-    """All emissive triangles of a scene, instances included; those without area are left out.
+def emitter_table(scene: Scene, strength: F64 | None = None) -> tuple[EmitterTable, NDArray[np.int64]]:
+    """All emissive triangles of a scene, instances included, and which item's each is; those without area are left out.
 
     Parameters
     ----------
     strength : (t,) float64, optional
         Channel sum of each triangle's mean radiance, where it is not simply its material's emission.
     """
-    corners, fronts, materials, numbers = [], [], [], []
+    corners, fronts, materials, numbers, owners = [], [], [], [], []
     first = scene.mesh_first_triangle
     items = [(0, np.eye(3, 4))] + list(zip(scene.instance_mesh.tolist(), scene.instance_transform, strict=True))
     weight = scene.materials.emission.astype(np.float64).sum(axis=1)[scene.triangle_material] if strength is None else strength
@@ -153,7 +153,7 @@ def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
         if not triangles.size:
             continue
         v = scene.positions[scene.indices[triangles]].astype(np.float64)
-        for of_mesh, m in items:
+        for item, (of_mesh, m) in enumerate(items):
             if of_mesh == mesh:
                 corners.append(v @ m[:, :3].T + m[:, 3])
                 mirrored = np.sign(np.linalg.det(m[:, :3]))
@@ -161,13 +161,14 @@ def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
                 fronts.append(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]) * mirrored)
                 materials.append(scene.triangle_material[triangles])
                 numbers.append(triangles)
+                owners.append(np.full(len(triangles), item))
     by_triangle = np.zeros(0) if strength is None else strength
     if not corners:
-        none = np.zeros((0, 3))
+        none, number = np.zeros((0, 3)), np.zeros(0, np.int64)
         return EmitterTable(
-            np.zeros((0, 3, 3)), none, np.zeros(0, np.uint32), np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0), 0.0, by_triangle
-        )
-    vertices, front, material, number = (np.concatenate(a) for a in (corners, fronts, materials, numbers))
+            np.zeros((0, 3, 3)), none, np.zeros(0, np.uint32), number, np.zeros(0, np.bool_), np.zeros(0), 0.0, by_triangle
+        ), number
+    vertices, front, material, number, owner = (np.concatenate(a) for a in (corners, fronts, materials, numbers, owners))
     twice_area = np.linalg.norm(front, axis=1)
     solid = twice_area > 0
     vertices, front, material, number, twice_area = (a[solid] for a in (vertices, front, material, number, twice_area))
@@ -176,7 +177,8 @@ def emitter_table(scene: Scene, strength: F64 | None = None) -> EmitterTable:
     cdf = np.cumsum(power / power.sum()) if power.size else np.zeros(0)
     if cdf.size:
         cdf[-1] = 1
-    return EmitterTable(vertices, front / twice_area[:, None], material, number, double_sided, cdf, float(power.sum()), by_triangle)
+    table = EmitterTable(vertices, front / twice_area[:, None], material, number, double_sided, cdf, float(power.sum()), by_triangle)
+    return table, owner[solid]
 
 
 @kernel

@@ -12,6 +12,7 @@ import numpy as np
 
 from bake_core.environment import sample_sky
 from bake_core.kernels import either, kernel
+from bake_core.light_tree import pick_emitter
 from bake_core.lights import choose, toward_light
 from bake_core.materials import scattered
 from bake_core.sampling import uniform_triangle
@@ -20,10 +21,13 @@ from bake_core.textures import emission_left
 
 
 @kernel
-def pdf_emitter(t, strength, two_sided, d2, facing):  # type: ignore[no-untyped-def]
-    """Per solid angle, of :func:`sample_emitter`, seen from a distance of √d2 under a cosine of `facing` at the emitter."""
+def pdf_emitter(share, strength, two_sided, d2, facing):  # type: ignore[no-untyped-def]
+    """Per solid angle, of :func:`sample_emitter`, seen from a distance of √d2 under a cosine of `facing` at the emitter.
+
+    `share` is the emitter's chance over its power, `strength` its power over the area of all its sides.
+    """
     sides = 2.0 if two_sided else 1.0
-    return strength * sides / t.emitters.total * d2 / max(facing, 1e-30)
+    return strength * sides * share * d2 / max(facing, 1e-30)
 
 
 @kernel
@@ -37,7 +41,7 @@ def emitter_strength(t, material, triangle):  # type: ignore[no-untyped-def]
 
 @kernel
 def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
-    """A point on the emissive triangles, chosen by power and area, as seen from a point.
+    """A point on the emissive triangles, as seen from a point: the triangle by :func:`bake_core.light_tree.pick_emitter`, there by area.
 
     Pdf: :func:`pdf_emitter`.
 
@@ -49,7 +53,7 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
     """
     e = t.emitters
     radiance = (0.0, 0.0, 0.0)
-    i, _ = choose(e.cdf, np.float64(w))
+    i, share = pick_emitter(t, (px, py, pz), np.float64(w))
     b1, b2 = uniform_triangle(u, v)
     b0 = 1.0 - b1 - b2
     x = b0 * e.vertices[i, 0, 0] + b1 * e.vertices[i, 1, 0] + b2 * e.vertices[i, 2, 0]
@@ -68,7 +72,7 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
             material, triangle = e.material[i], e.triangle[i]
             radiance = emission_left(t, material, triangle, np.float64(b1), np.float64(b2))
             if radiance[0] + radiance[1] + radiance[2] > 0:
-                pdf = pdf_emitter(t, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
+                pdf = pdf_emitter(share, emitter_strength(t, material, triangle), e.double_sided[i], d2, facing * side)
     # A shadow ray's end errs by an ulp of its own length too: a lamp about zero would else block itself.
     lift = side * EPSILON * (abs(x) + abs(y) + abs(z) + d)
     lifted = (x + lift * e.normal[i, 0], y + lift * e.normal[i, 1], z + lift * e.normal[i, 2])

@@ -12,6 +12,7 @@ from bake_core import embree
 from bake_core.environment import Environment, Sky
 from bake_core.ggx_albedo import AlbedoTable, albedo_table
 from bake_core.light_cache import LightCache
+from bake_core.light_tree import FEWEST_EMITTERS, LightTree, light_tree
 from bake_core.lights import EmitterTable, LightTable, emitter_table, light_table, merge_lights
 from bake_core.materials import MaterialTable, gloss_table, material_table
 from bake_core.ray_log import RayLog
@@ -37,6 +38,8 @@ class Tables(NamedTuple):
     item_first_triangle : (1 + i,) int64
     item_transform, item_normal : (1 + i, 3, 4) and (1 + i, 3, 3) float64
         Of points, and of normals up to a positive factor.
+    tree : LightTree, optional
+        Over the emitters, where they are many.
     cache : LightCache, optional
         Where paths end that it knows the rest of.
     log : RayLog, optional
@@ -59,6 +62,7 @@ class Tables(NamedTuple):
     environment: NDArray[np.float64]
     sky: Sky | None
     max_bounces: np.int64
+    tree: LightTree | None = None
     cache: LightCache | None = None
     log: RayLog | None = None
 
@@ -87,6 +91,7 @@ class Tracer:
         corners[:, :9] = scene.positions[scene.indices].reshape(-1, 9)
         corners[:, 9] = scene.triangle_material.view(np.float32)
         lights = merge_lights(scene, spec)
+        emitters, item = emitter_table(scene)
         transforms = np.concatenate([np.eye(3, 4)[None], scene.instance_transform.reshape(-1, 3, 4)])
         tables = Tables(
             handle=np.uint64(geometry.handle),
@@ -100,14 +105,18 @@ class Tracer:
             materials=material_table(scene),
             gloss=gloss_table(scene),
             textures=texture_table(scene),
-            emitters=emitter_table(scene),
+            emitters=emitters,
             lights=light_table(lights, scene.bounds - scene.origin),
             environment=environment.constant,
             sky=environment.sky,
             max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
         )
         if emits_unevenly(scene):
-            tables = tables._replace(emitters=emitter_table(scene, mean_emission(tables, scene)))
+            emitters, item = emitter_table(scene, mean_emission(tables, scene))
+            tables = tables._replace(emitters=emitters)
+        if len(item) >= FEWEST_EMITTERS:
+            emitters, tree = light_tree(scene, emitters, item)
+            tables = tables._replace(emitters=emitters, tree=tree)
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
 
     def without_environment(self) -> Tracer:

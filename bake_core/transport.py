@@ -15,6 +15,7 @@ from bake_core.embree import set_ray
 from bake_core.environment import environment_radiance, has_sky
 from bake_core.kernels import kernel
 from bake_core.light_cache import cached_light
+from bake_core.light_tree import emitter_share
 from bake_core.materials import INV_PI, gloss, is_glossy, lambert_cosine, no_gloss, sample_gloss, sample_lambert, scattered
 from bake_core.next_event import emitter_strength, from_emitters, from_lights, from_sky, pdf_emitter
 from bake_core.ray_log import ask_nearest
@@ -138,11 +139,12 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         if le_r + le_g + le_b > 0:
             dark = 0
             strength = emitter_strength(t, material, triangle)
+            share = emitter_share(t, ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18], triangle, (ox, oy, oz))
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
-                light_pdf = pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
+                light_pdf = pdf_emitter(share, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)
             else:
-                gain = pdf / (pdf + pdf_emitter(t, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)) / survival
+                gain = pdf / (pdf + pdf_emitter(share, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)) / survival
                 indirect_r += beta_r * gain * le_r
                 indirect_g += beta_g * gain * le_g
                 indirect_b += beta_b * gain * le_b

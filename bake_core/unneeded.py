@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bake_core.light_tree import FEWEST_EMITTERS
 from bake_core.selection import LeftOut
 from bake_core.tracer import Tables
 
@@ -9,8 +10,8 @@ from bake_core.tracer import Tables
 def unneeded(tables: Tables, *, sealed: bool = False) -> tuple[LeftOut, ...]:
     """All that tracing a scene needs no code for, in the order in which a path would come to it.
 
-    Compiled out are textures, gloss and skies, each of which makes a path slower by being there; the rest is one test of a length that
-    never changes, and costs nothing that can be measured (docs/method.md says how that was found).
+    Compiled out are textures, gloss, skies and a light tree, each of which makes a path slower by being there; the rest is one test of a
+    length that never changes, and costs nothing that can be measured (docs/method.md says how that was found).
 
     Parameters
     ----------
@@ -41,6 +42,9 @@ def unneeded(tables: Tables, *, sealed: bool = False) -> tuple[LeftOut, ...]:
         found.append(("code for environment", "it is black: a path's last ray is not traced where nothing is emissive"))
     if not len(t.emitters.cdf):
         found.append(("code for emitter sampling", "no triangle is emissive: no ray is sent to one"))
+    elif t.tree is None:
+        why = f"fewer than {FEWEST_EMITTERS} triangles are emissive: their power alone chooses, and no tree over them is compiled in"
+        found.append(("code for a light tree", why))
     if not len(t.lights.cdf):
         found.append(("code for light sampling", "neither scene nor spec has a punctual or directional light: no ray is sent to one"))
     if len(t.item_first_triangle) == 1:

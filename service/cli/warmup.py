@@ -57,16 +57,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compile_the_others(scene: Scene, spec: Spec, folder: Path) -> None:
-    """For each kind of scene: a kernel's machine code hangs on whether there are gloss, textures, an image for a sky, and a light cache."""
+    """For each kind of scene: a kernel's machine code hangs on whether there are gloss, textures, an image for a sky, caches, a tree."""
     import numpy as np
 
     from bake_core.bake import compile_kernels
     from bake_core.environment import beside
     from bake_core.ggx_albedo import albedo_table
     from bake_core.images import write_exr
+    from bake_core.light_tree import light_tree
+    from bake_core.lights import emitter_table
     from bake_core.prepared import prepare
     from bake_core.spec import ConstantEnvironment, EquirectEnvironment
 
+    _, tree = light_tree(scene, *emitter_table(scene))
     write_exr(folder / "sky.exr", np.ones((2, 4, 3), np.float32), ("R", "G", "B"))
     for environment in (ConstantEnvironment(), EquirectEnvironment(kind="equirect", image="sky.exr")):
         for integrator in ("path", "cache"):
@@ -75,4 +78,6 @@ def _compile_the_others(scene: Scene, spec: Spec, folder: Path) -> None:
             whole = prepared.whole
             glossy = replace(whole, tables=whole.tables._replace(gloss=albedo_table()))
             for tracer in (whole, glossy, whole.general(scene)):
-                compile_kernels(prepared.traced_with(tracer), audited=True)
+                many_lamps = replace(tracer, tables=tracer.tables._replace(tree=tree))
+                for one in (tracer, many_lamps):
+                    compile_kernels(prepared.traced_with(one), audited=True)
