@@ -23,6 +23,7 @@ I64 = NDArray[np.int64]
 
 # Emissive triangles below which power alone chooses: a tree costs a tenth of a microsecond a light.
 FEWEST_EMITTERS = 16
+_BELOW_ONE = 1 - 2.0**-53
 
 
 class LightTree(NamedTuple):
@@ -53,22 +54,21 @@ def light_tree(scene: Scene, emitters: EmitterTable, item: I64) -> tuple[Emitter
     n = len(emitters.cdf)
     leaves = 1 << (n - 1).bit_length()
     order = _ordered(emitters.vertices.mean(1), leaves)
-    sides = np.where(emitters.double_sided, 2, 1)
-    power = np.diff(emitters.cdf, prepend=0.0) * emitters.total
     corners, normal = emitters.vertices[order], emitters.normal[order]
+    material, triangle = emitters.material[order], emitters.triangle[order]
+    two_sided = emitters.double_sided[order]
+    # Not the differences of the running sum: beside a sun a candle's is 0.
+    strength = emitters.strength[triangle] if len(emitters.strength) else scene.materials.emission.astype(np.float64).sum(1)[material]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    power = strength * area * np.where(two_sided, 2, 1)
     table = emitters._replace(
-        vertices=corners,
-        normal=normal,
-        material=emitters.material[order],
-        triangle=emitters.triangle[order],
-        double_sided=emitters.double_sided[order],
-        cdf=np.cumsum(power[order]) / power.sum(),
+        vertices=corners, normal=normal, material=material, triangle=triangle, double_sided=two_sided, cdf=np.cumsum(power / power.sum())
     )
     table.cdf[-1] = 1
     low, high = np.full((leaves, 3), np.inf), np.full((leaves, 3), -np.inf)
     low[:n], high[:n] = corners.min(1), corners.max(1)
     axis, cosine, strong = np.zeros((leaves, 3)), np.ones(leaves), np.zeros(leaves)
-    axis[:n], cosine[:n], strong[:n] = normal, np.where(sides[order] == 2, -1.0, 1.0), power[order]
+    axis[:n], cosine[:n], strong[:n] = normal, np.where(two_sided, -1.0, 1.0), power
     levels = [_nodes(low, high, axis, cosine, strong)]
     while len(strong) > 1:
         low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
@@ -112,9 +112,8 @@ def _lookup(scene: Scene, item: I64, triangle: I64) -> I64:
 def _nodes(low: F64, high: F64, axis: F64, cosine: F64, power: F64) -> F64:
     """One level of :attr:`LightTree.nodes`; what has no power has no place either."""
     low, high = (np.where(power[:, None] > 0, x, 0.0) for x in (low, high))
-    columns = np.linalg.norm(high - low, axis=1) / 2, cosine, np.sqrt(1 - cosine**2), power
-    radius, cosine, sine, power = (x[:, None] for x in columns)
-    return np.concatenate([(low + high) / 2, radius, axis, cosine, sine, power], 1)
+    radius = np.linalg.norm(high - low, axis=1) / 2
+    return np.column_stack([(low + high) / 2, radius, axis, cosine, np.sqrt(1 - cosine**2), power])
 
 
 def _cones(axis: F64, cosine: F64, power: F64) -> tuple[F64, F64]:
@@ -167,12 +166,14 @@ def _pick(t, p, w):  # type: ignore[no-untyped-def]
         if first < 0:
             return 0, 0.0
         if w < first:
-            w /= first
+            w = w / first
             chance *= first
         else:
             w = (w - first) / (1 - first)
             chance *= 1 - first
             i += 1
+        # Rounding must not make it 1, which no chance is above.
+        w = min(w, _BELOW_ONE)
     return i - leaf, chance / nodes[i, 9]
 
 
