@@ -44,7 +44,7 @@ def unneeded(tables: Tables, *, sealed: bool = False) -> tuple[LeftOut, ...]:
         found.append(("code for emitter sampling", "no triangle is emissive: no ray is sent to one"))
     elif t.tree is None:
         why = f"fewer than {FEWEST_EMITTERS} triangles are emissive: their power alone chooses, and no tree over them is compiled in"
-        found.append(("code for a light tree", why))
+        found.append(("code for light tree", why))
     if not len(t.lights.cdf):
         found.append(("code for light sampling", "neither scene nor spec has a punctual or directional light: no ray is sent to one"))
     if len(t.item_first_triangle) == 1:
