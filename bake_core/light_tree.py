@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.kernels import either, kernel
-from bake_core.lights import EmitterTable, choose
+from bake_core.lights import EmitterTable, Emitting, choose, running_sum
 from bake_core.scene import Scene
 
 F64 = NDArray[np.float64]
@@ -43,39 +43,32 @@ class LightTree(NamedTuple):
     lookup: I64
 
 
-def light_tree(scene: Scene, emitters: EmitterTable, item: I64) -> tuple[EmitterTable, LightTree]:
-    """Emitters in the order of a tree's leaves, and the tree.
-
-    Parameters
-    ----------
-    item : (e,) int64
-        Which item's each emitter is.
-    """
+def light_tree(scene: Scene, emitters: EmitterTable, emitting: Emitting) -> tuple[EmitterTable, LightTree]:
+    """Emitters, as :func:`bake_core.lights.emitter_table` has them, in the order of a tree's leaves; and the tree."""
     n = len(emitters.cdf)
     leaves = 1 << (n - 1).bit_length()
     order = _ordered(emitters.vertices.mean(1), leaves)
-    corners, normal = emitters.vertices[order], emitters.normal[order]
-    material, triangle = emitters.material[order], emitters.triangle[order]
-    two_sided = emitters.double_sided[order]
     # Not the differences of the running sum: beside a sun a candle's is 0.
-    strength = emitters.strength[triangle] if len(emitters.strength) else scene.materials.emission.astype(np.float64).sum(1)[material]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    power = strength * area * np.where(two_sided, 2, 1)
+    item, power = emitting.item[order], emitting.power[order]
     table = emitters._replace(
-        vertices=corners, normal=normal, material=material, triangle=triangle, double_sided=two_sided, cdf=np.cumsum(power / power.sum())
+        vertices=emitters.vertices[order],
+        normal=emitters.normal[order],
+        material=emitters.material[order],
+        triangle=emitters.triangle[order],
+        double_sided=emitters.double_sided[order],
+        cdf=running_sum(power),
     )
-    table.cdf[-1] = 1
     low, high = np.full((leaves, 3), np.inf), np.full((leaves, 3), -np.inf)
-    low[:n], high[:n] = corners.min(1), corners.max(1)
+    low[:n], high[:n] = table.vertices.min(1), table.vertices.max(1)
     axis, cosine, strong = np.zeros((leaves, 3)), np.ones(leaves), np.zeros(leaves)
-    axis[:n], cosine[:n], strong[:n] = normal, np.where(two_sided, -1.0, 1.0), power
+    axis[:n], cosine[:n], strong[:n] = table.normal, np.where(table.double_sided, -1.0, 1.0), power
     levels = [_nodes(low, high, axis, cosine, strong)]
     while len(strong) > 1:
         low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
         axis, cosine = _cones(axis, cosine, strong)
         strong = strong[::2] + strong[1::2]
         levels.append(_nodes(low, high, axis, cosine, strong))
-    return table, LightTree(np.concatenate(levels[::-1]), _lookup(scene, item[order], table.triangle))
+    return table, LightTree(np.concatenate(levels[::-1]), _lookup(scene, item, table.triangle))
 
 
 def _ordered(centre: F64, leaves: int) -> I64:
@@ -134,7 +127,7 @@ def importance(nodes, i, p):  # type: ignore[no-untyped-def]
     """What a point may get of a node: its power over the squared distance d² to its centre, times the greatest n · (p - x) / d, at most 1.
 
     Of all normals n in a cone and all places x in a sphere, none gives a greater n · (p - x) than the normal that leans most towards the
-    point does at the sphere's centre, and the sphere's radius more. So it is 0 only for what no emitter of the node shines on.
+    point does at the sphere's centre, and the sphere's radius more. So, but for rounding, it is 0 only where no emitter of the node shines.
     """
     x, y, z = p[0] - nodes[i, 0], p[1] - nodes[i, 1], p[2] - nodes[i, 2]
     d2 = x * x + y * y + z * z

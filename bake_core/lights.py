@@ -121,9 +121,6 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
     weight = np.where(lights.kind == LIGHT_DIRECTIONAL, strength, strength / typical)
     shining = weight > 0
     weight = weight[shining]
-    cdf = np.cumsum(weight / weight.sum()) if weight.size else np.zeros(0)
-    if cdf.size:
-        cdf[-1] = 1
     return LightTable(
         lights.kind[shining],
         lights.position[shining].astype(np.float64),
@@ -131,12 +128,19 @@ def light_table(lights: Lights, bounds: F64) -> LightTable:
         lights.value[shining].astype(np.float64),
         cone_ramps(lights)[shining],
         lights.range[shining].astype(np.float64),
-        cdf,
+        running_sum(weight),
     )
 
 
-def emitter_table(scene: Scene, strength: F64 | None = None) -> tuple[EmitterTable, NDArray[np.int64]]:
-    """All emissive triangles of a scene, instances included, and which item's each is; those without area are left out.
+class Emitting(NamedTuple):
+    """What is known of emitters beside what kernels read, each (e,): which item's they are; their power, area × weight × sides."""
+
+    item: NDArray[np.int64]
+    power: F64
+
+
+def emitter_table(scene: Scene, strength: F64 | None = None) -> tuple[EmitterTable, Emitting]:
+    """All emissive triangles of a scene, instances included; those without area are left out.
 
     Parameters
     ----------
@@ -165,20 +169,26 @@ def emitter_table(scene: Scene, strength: F64 | None = None) -> tuple[EmitterTab
     by_triangle = np.zeros(0) if strength is None else strength
     if not corners:
         none, number = np.zeros((0, 3)), np.zeros(0, np.int64)
-        return EmitterTable(
+        table = EmitterTable(
             np.zeros((0, 3, 3)), none, np.zeros(0, np.uint32), number, np.zeros(0, np.bool_), np.zeros(0), 0.0, by_triangle
-        ), number
+        )
+        return table, Emitting(number, np.zeros(0))
     vertices, front, material, number, owner = (np.concatenate(a) for a in (corners, fronts, materials, numbers, owners))
     twice_area = np.linalg.norm(front, axis=1)
     solid = twice_area > 0
     vertices, front, material, number, twice_area = (a[solid] for a in (vertices, front, material, number, twice_area))
     double_sided = scene.materials.double_sided[material]
     power = weight[number] * twice_area / 2 * np.where(double_sided, 2, 1)
-    cdf = np.cumsum(power / power.sum()) if power.size else np.zeros(0)
-    if cdf.size:
-        cdf[-1] = 1
-    table = EmitterTable(vertices, front / twice_area[:, None], material, number, double_sided, cdf, float(power.sum()), by_triangle)
-    return table, owner[solid]
+    normal, total = front / twice_area[:, None], float(power.sum())
+    table = EmitterTable(vertices, normal, material, number, double_sided, running_sum(power), total, by_triangle)
+    return table, Emitting(owner[solid], power)
+
+
+def running_sum(weight: F64) -> F64:
+    """Of weights over all of them together: what :func:`choose` takes. The last is 1."""
+    cdf: F64 = np.cumsum(weight / weight.sum()) if weight.size else np.zeros(0)
+    cdf[-1:] = 1
+    return cdf
 
 
 @kernel

@@ -29,6 +29,12 @@ _PASSED = 1 + 2.0**-20
 
 
 @kernel
+def hit_item(ray_bits):  # type: ignore[no-untyped-def]
+    """Which item a hit is of: an instance's number, or mesh 0's."""
+    return ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18]
+
+
+@kernel
 def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     """What a hit found, from the RTCRayHit it left behind.
 
@@ -50,7 +56,7 @@ def surface(t, ray_bits, ray, dx, dy, dz):  # type: ignore[no-untyped-def]
     twice_area : float64
         Of the triangle in the local frame, m².
     """
-    item = ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18]
+    item = hit_item(ray_bits)
     triangle = t.item_first_triangle[item] + ray_bits[17]
     b1 = max(np.float64(ray[15]), _INSET)
     b2 = max(np.float64(ray[16]), _INSET)
@@ -158,7 +164,7 @@ def blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-
         ask_nearest(t, ray)
         if ray_bits[18] == INVALID:
             return False
-        item = ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18]
+        item = hit_item(ray_bits)
         triangle = t.item_first_triangle[item] + ray_bits[17]
         material = t.corner_bits[triangle, 9]
         if not lets_through(t, material, triangle, np.float64(ray[15]), np.float64(ray[16]), ray_bits):

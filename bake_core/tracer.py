@@ -91,7 +91,7 @@ class Tracer:
         corners[:, :9] = scene.positions[scene.indices].reshape(-1, 9)
         corners[:, 9] = scene.triangle_material.view(np.float32)
         lights = merge_lights(scene, spec)
-        emitters, item = emitter_table(scene)
+        emitters, emitting = emitter_table(scene)
         transforms = np.concatenate([np.eye(3, 4)[None], scene.instance_transform.reshape(-1, 3, 4)])
         tables = Tables(
             handle=np.uint64(geometry.handle),
@@ -112,10 +112,10 @@ class Tracer:
             max_bounces=np.int64(np.iinfo(np.int32).max if spec.max_bounces is None else spec.max_bounces),
         )
         if emits_unevenly(scene):
-            emitters, item = emitter_table(scene, mean_emission(tables, scene))
+            emitters, emitting = emitter_table(scene, mean_emission(tables, scene))
             tables = tables._replace(emitters=emitters)
-        if len(item) >= FEWEST_EMITTERS:
-            emitters, tree = light_tree(scene, emitters, item)
+        if len(emitters.cdf) >= FEWEST_EMITTERS:
+            emitters, tree = light_tree(scene, emitters, emitting)
             tables = tables._replace(emitters=emitters, tree=tree)
         return cls(scene.origin, lights, tables, geometry, scene.triangle_count)
 

@@ -20,7 +20,7 @@ from bake_core.materials import INV_PI, gloss, is_glossy, lambert_cosine, no_glo
 from bake_core.next_event import emitter_strength, from_emitters, from_lights, from_sky, pdf_emitter
 from bake_core.ray_log import ask_nearest
 from bake_core.sampling import STRATIFIED_VERTICES, random_pair, sobol_pair
-from bake_core.surfaces import INFINITE, INVALID, MAX_PASSED, blocked, surface
+from bake_core.surfaces import INFINITE, INVALID, MAX_PASSED, blocked, hit_item, surface
 from bake_core.textures import emission_at, lets_through, reflectance, scattered_spread, widened
 
 # Roulette by throughput begins where a path has lost 90 % of its weight. With the chance to go on equal to throughput / τ below τ, a
@@ -139,7 +139,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         if le_r + le_g + le_b > 0:
             dark = 0
             strength = emitter_strength(t, material, triangle)
-            share = emitter_share(t, ray_bits[19] if ray_bits[19] != INVALID else ray_bits[18], triangle, (ox, oy, oz))
+            share = emitter_share(t, hit_item(ray_bits), triangle, (ox, oy, oz))
             if depth == 0:
                 emitted_r, emitted_g, emitted_b = le_r, le_g, le_b
                 light_pdf = pdf_emitter(share, strength, two_sided, hx * hx + hy * hy + hz * hz, facing)

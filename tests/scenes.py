@@ -27,12 +27,17 @@ SQUARE = np.array([[-0.5, 0, -0.5], [-0.5, 0, 0.5], [0.5, 0, 0.5], [0.5, 0, -0.5
 ONE_PROBE = {"name": "one", "origin": [0.0, 0.0, 0.0], "spacing": [1.0, 1.0, 1.0], "counts": [1, 1, 1]}
 
 
-def load(writer: GlbWriter) -> Scene:
-    """What the reader makes of what the writer wrote."""
+def load_example(glb: bytes) -> Scene:
+    """What the reader makes of it, in no folder of the test's."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.glb"
-        path.write_bytes(writer.to_glb())
+        path.write_bytes(glb)
         return load_scene(path)
+
+
+def load(writer: GlbWriter) -> Scene:
+    """What the reader makes of what the writer wrote."""
+    return load_example(writer.to_glb())
 
 
 def build(scene: Scene | GlbWriter, **spec: Any) -> Tracer:

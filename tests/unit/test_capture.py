@@ -18,10 +18,9 @@ from bake_core.examples import closed_box, plane_under_sun, square_emitter, two_
 from bake_core.octahedral import texel_directions
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
-from tests.scenes import build, sky, square_scene
+from tests.scenes import build, load_example, sky, square_scene
 from tests.unit.gltf_build import face_normals, world_triangles
 from tests.unit.test_octahedral import quadrature
-from tests.unit.test_transport import load_example
 
 Array = NDArray[Any]
 POSITIONS = np.array([[-0.55, -0.45, -0.6], [0.45, 0.55, 0.4], [0.1, 0.2, -0.3], [0.0, 0.0, 0.0], [0.7, -0.7, 0.2]] * 2)

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from dataclasses import replace
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,38 +15,22 @@ from bake_core.bake import empty_state
 from bake_core.cache_cells import codes
 from bake_core.cache_points import Points
 from bake_core.errors import Cancelled
-from bake_core.examples import Example, box_sides, closed_box, cornell, quads_part, two_rooms
+from bake_core.examples import box_sides, closed_box, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
 from bake_core.light_cache import AXIS_CELLS, cell_key, cell_of, facing
 from bake_core.octahedral import texel_directions
-from bake_core.prepared import Prepared, prepare
-from bake_core.shards import shard_ranges, trace_shard
+from bake_core.prepared import prepare
+from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
 from bake_core.surface_light import SurfaceLight
-from bake_core.tally import State
+from tests.baking import prepared, traced
 from tests.scenes import add_square, load
-from tests.unit.gltf_build import load_glb
 
 Array = NDArray[Any]
 # Of a box from -1 to 1.
 _INSIDE = {"origin": [-0.75, -0.75, -0.75], "spacing": [0.5, 0.5, 0.5], "counts": [4, 4, 4]}
 # Of a Cornell box.
 _IN_CORNELL = {"origin": [-0.75, 0.25, -0.75], "spacing": [0.5, 0.5, 0.5], "counts": [4, 4, 4]}
-
-
-def prepared(example: Example, **spec: Any) -> Prepared:
-    glb, own = example
-    with tempfile.TemporaryDirectory() as folder:
-        return prepare(load_glb(glb, Path(folder)), parse_spec({**own, **spec}), threads=2)
-
-
-def traced(p: Prepared, ends: tuple[int, ...] = (16, 32), shards: int = 1, threads: int = 2) -> State:
-    """Whole passes, up to each of these samples."""
-    state = empty_state(p)
-    for samples in pairwise((0, *ends)):
-        given = state.allocation
-        state.add([trace_shard(p, r, samples, given, threads=threads) for r in shard_ranges(p.probe_count, shards)])
-    return state
 
 
 # --- cells -------------------------------------------------------------------------------------------------------------------------

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.examples import lamp_corridor, many_lamps
+from bake_core.examples import lamp_corridor
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.kernels import entry_kernel
 from bake_core.light_tree import FEWEST_EMITTERS, emitter_share, importance, pick_emitter
 from bake_core.tracer import Tracer
-from tests.reference.light_tree_table import race
+from tests.baking import prepared, traced
+from tests.reference.light_tree_table import lamps_on_a_ceiling, race
 from tests.scenes import QUAD, SQUARE, add_square, build
-from tests.unit.test_light_cache import prepared, traced
 
 Array = NDArray[Any]
 
@@ -143,7 +143,7 @@ def test_no_emitter_that_faces_a_point_is_left_out(about: Tracer) -> None:
 
 def test_the_light_stays_what_it_was_and_its_noise_does_not() -> None:
     """Along a corridor: the mean agrees within its noise, the squared error is far less. In a small room of many lamps nothing is lost."""
-    for example, least in ((lamp_corridor(64), 20.0), (many_lamps(98), 1.5)):
+    for example, least in ((lamp_corridor(64), 20.0), (lamps_on_a_ceiling(98), 1.5)):
         found = race(example, 32)
         assert abs(found.difference) < 4, found
         assert found.variances > least, found

@@ -27,8 +27,7 @@ from bake_core.prepared import prepare
 from bake_core.scene import Scene
 from bake_core.selection import Selection, select
 from bake_core.spec import OUTPUTS, Stop, parse_spec
-from tests.scenes import ONE_PROBE, QUAD, SQUARE, add_square, load, square_scene
-from tests.unit.test_transport import load_example
+from tests.scenes import ONE_PROBE, QUAD, SQUARE, add_square, load, load_example, square_scene
 
 
 def spec(**changes: Any) -> Any:

@@ -10,7 +10,7 @@ from bake_core.examples import cornell
 from bake_core.prepared import Prepared, prepare
 from bake_core.ray_log import ANY, NEAREST, RayLog, coherent_order, new_log, replay
 from bake_core.spec import parse_spec
-from tests.unit.test_transport import load_example
+from tests.scenes import load_example
 
 
 def traced(probes: NDArray[np.int64], size: int) -> tuple[Prepared, RayLog]:

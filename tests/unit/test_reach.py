@@ -22,8 +22,7 @@ from bake_core.spec import parse_spec
 from service.cli import main
 from tests.baking import bake_example, maps
 from tests.conformance import synthetic
-from tests.scenes import add_square, load
-from tests.unit.test_transport import load_example
+from tests.scenes import add_square, load, load_example
 
 F64 = NDArray[np.float64]
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])

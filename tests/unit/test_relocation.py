@@ -15,8 +15,7 @@ from bake_core.relocation import FARTHEST
 from bake_core.relocation_trial import Trial
 from bake_core.spec import parse_spec
 from tests.baking import bake_example
-from tests.scenes import add_square, load
-from tests.unit.test_transport import load_example
+from tests.scenes import add_square, load, load_example
 
 # Of a spacing, of a probe half a spacing from a wall.
 MOVED = 1.5 * 1.5 / 8

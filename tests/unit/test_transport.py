@@ -21,7 +21,7 @@ from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
 from bake_core.stability.scenes import box_with_hole
 from bake_core.stability.scenes import scene as glb_of
-from tests.scenes import QUAD, SQUARE, add_square, build, camera_at, icosphere, load, polygon_irradiance, sky
+from tests.scenes import QUAD, SQUARE, add_square, build, camera_at, icosphere, load, load_example, polygon_irradiance, sky
 from tests.unit.gltf_build import load_glb
 
 Array = NDArray[Any]
@@ -152,13 +152,6 @@ def test_white_and_sealed_without_light_is_black_and_ends() -> None:
     with_lamp_outside = {**spec, "environment": sky(1e6), "lights": [{"kind": "point", "position": [3, 0, 0], "intensity": [1e6] * 3}]}
     scene = load_example(glb)
     assert not irradiance(prepared(scene, with_lamp_outside), 16).any()
-
-
-def load_example(glb: bytes) -> Scene:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        return load_glb(glb, Path(folder))
 
 
 # --- leaks and scales ---------------------------------------------------------------------------------------------------------------
