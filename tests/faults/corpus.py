@@ -7,116 +7,22 @@ from __future__ import annotations
 
 import base64
 import copy
-import io
-import json
-import os
 import struct
-import warnings
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bake_core.gltf.writer import GlbWriter, Part, pack_glb
+from tests.faults.fault import FLOAT32_HUGE, FLOAT32_INF, FLOAT32_NAN, GLB, GLTF, REMOVE, Fault, Json, changed, dump, put, sound
+from tests.faults.other_files import mesh_faults, zip_faults
 from tests.pictures import png, png_header
-
-Json = dict[str, Any]
-GLB, GLTF = "scene.glb", "scene.gltf"
-FLOAT32_NAN, FLOAT32_INF, FLOAT32_HUGE = (struct.pack("<f", v) for v in (float("nan"), float("inf"), 3e38))
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One scene that must be refused.
-
-    Attributes
-    ----------
-    name : str
-        What is wrong with it, in a few words; unique.
-    slug : str
-        Expected slug of the SceneError.
-    where : str
-        Expected place, exactly.
-    files : mapping of str to bytes
-        The scene's files by name.
-    root : str
-        Which of them is the scene.
-    links : mapping of str to str
-        Symbolic links to make in the folder, name to target: faults that only a file system can have, not an upload.
-    folders : tuple of str
-        Folders to make, likewise.
-    """
-
-    name: str
-    slug: str
-    where: str
-    files: Mapping[str, bytes]
-    root: str = GLB
-    links: Mapping[str, str] = field(default_factory=dict)
-    folders: tuple[str, ...] = ()
-
-    @property
-    def needs_file_system(self) -> bool:
-        return bool(self.links or self.folders)
-
-    def write(self, folder: Path) -> Path:
-        """Write it into an empty folder; the scene's path."""
-        for name, data in self.files.items():
-            (folder / name).write_bytes(data)
-        for name in self.folders:
-            (folder / name).mkdir()
-        for name, target in self.links.items():
-            os.symlink(target, folder / name)
-        return folder / self.root
 
 
 def corpus() -> list[Fault]:
     """Every fault, in a fixed order."""
     gltf = [*_containers(), *_json_faults(), *_uri_faults(), *_field_faults(), *_data_faults(), *_texture_faults(), *_unsupported()]
-    return [*gltf, *_zip_faults(), *_mesh_faults()]
-
-
-def sound() -> tuple[Json, bytes]:
-    """JSON and binary of the sound scene that most faults are made from: a square with everything on it, used by two nodes."""
-    w = GlbWriter()
-    grey = w.material("grey", (0.5, 0.5, 0.5), emission=(2.0, 1.0, 0.0))
-    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    part = Part(square, [0, 1, 2, 0, 2, 3], [[0, 0, 1], [0, 1, 1], [0, 0, 1], [0, 0, 1]], [[1, 1, 1, 1]] * 4, grey)
-    mesh = w.mesh("square", [part])
-    w.node("floor", mesh=mesh)
-    lamp = w.node("lamp", light=w.light("spot", inner=0.1, outer=0.5))
-    w.node("twin", mesh=mesh, translation=(0, 0, 2), rotation=(0, 0, 0, 1), scale=(1, 2, 1), children=[lamp])
-    w.node("eye", camera=w.camera(1.0))
-    return w.document(), bytes(w._binary)
-
-
-def changed(*edits: tuple[str, Any]) -> bytes:
-    """The sound scene with fields set; paths as ``accessors/0/count``. A callable gets the old value and gives the new."""
-    document, binary = sound()
-    for path, value in edits:
-        _put(document, path, value)
-    return pack_glb(_dump(document), binary)
-
-
-_REMOVE = object()
-
-
-def _put(document: Any, path: str, value: Any) -> None:
-    parts: list[Any] = [int(s) if s.isdecimal() else s for s in path.split("/")]
-    *steps, last = parts
-    for step in steps:
-        document = document[step] if isinstance(document, list) else document.setdefault(step, {})
-    if value is _REMOVE:
-        del document[last]
-    else:
-        document[last] = value(document[last]) if callable(value) else value
-
-
-def _dump(document: Any) -> bytes:
-    return json.dumps(document, separators=(",", ":")).encode()
+    return [*gltf, *zip_faults(), *mesh_faults()]
 
 
 def _glb(name: str, slug: str, where: str, data: bytes) -> Fault:
@@ -130,7 +36,7 @@ def _edit(name: str, slug: str, where: str, *edits: tuple[str, Any]) -> Fault:
 def _containers() -> Iterator[Fault]:
     sound_glb = changed()
     document, binary = sound()
-    text = _dump(document)
+    text = dump(document)
     text += b" " * (-len(text) % 4)
     binary += bytes(-len(binary) % 4)
 
@@ -187,8 +93,8 @@ def _json_faults() -> Iterator[Fault]:
     yield Fault("a .gltf that is no JSON", "gltf.bad_json", GLTF, {GLTF: b"hello"}, GLTF)
     yield Fault("an empty .gltf", "gltf.bad_json", GLTF, {GLTF: b""}, GLTF)
     yield _edit("half a surrogate pair in a name", "bad_json", "nodes[0].name", ("nodes/0/name", "\ud800"))
-    yield _edit("no asset", "missing_key", "asset", ("asset", _REMOVE))
-    yield _edit("no version", "missing_key", "asset.version", ("asset/version", _REMOVE))
+    yield _edit("no asset", "missing_key", "asset", ("asset", REMOVE))
+    yield _edit("no version", "missing_key", "asset.version", ("asset/version", REMOVE))
     yield _edit("version is a number", "wrong_type", "asset.version", ("asset/version", 2.0))
     yield _edit("glTF 1", "bad_version", "asset.version", ("asset/version", "1.0"))
     yield _edit("glTF 3", "bad_version", "asset.version", ("asset/version", "3.0"))
@@ -207,7 +113,7 @@ def _uri_faults() -> Iterator[Fault]:
         else:
             gltf["buffers"][0]["uri"] = uri
         where = f"buffers[{int(unused)}].uri"
-        return Fault(name, f"gltf.{slug}", where, {GLTF: _dump(gltf), "scene.bin": binary}, GLTF, **more)
+        return Fault(name, f"gltf.{slug}", where, {GLTF: dump(gltf), "scene.bin": binary}, GLTF, **more)
 
     for unused in (False, True):
         kind = " in an unused buffer" if unused else ""
@@ -380,9 +286,9 @@ def _field_faults() -> Iterator[Fault]:
         ("cameras/0/perspective", "cameras[0].perspective"),
         ("cameras/0/perspective/yfov", "cameras[0].perspective.yfov"),
     ):
-        yield _edit(f"no {where}", "missing_key", where, (path, _REMOVE))
+        yield _edit(f"no {where}", "missing_key", where, (path, REMOVE))
 
-    yield _edit("no scenes", "no_scene", "scenes", ("scenes", _REMOVE), ("scene", _REMOVE))
+    yield _edit("no scenes", "no_scene", "scenes", ("scenes", REMOVE), ("scene", REMOVE))
     yield _edit("a node that is its own child", "node_cycle", "nodes[4]", ("nodes", lambda old: [*old, {"children": [4]}]))
     cycle = [{"children": [5]}, {"children": [4], "name": "b"}]
     yield _edit("two nodes that are each other's child", "node_cycle", "nodes[4]", ("nodes", lambda old: old + cycle))
@@ -445,8 +351,8 @@ class _Raw(str):
 def _raw_changed(path: str, value: Any) -> bytes:
     document, binary = sound()
     literals = [v for v in (value if isinstance(value, list) else [value]) if isinstance(v, _Raw)]
-    _put(document, path, value)
-    text = _dump(document)
+    put(document, path, value)
+    text = dump(document)
     for literal in literals:
         text = text.replace(f'"{literal}"'.encode(), literal.encode())
     return pack_glb(text, binary)
@@ -461,8 +367,8 @@ def _data_faults() -> Iterator[Fault]:
     def patched(at: int, data: bytes, *edits: tuple[str, Any]) -> bytes:
         gltf = copy.deepcopy(document)
         for path, value in edits:
-            _put(gltf, path, value)
-        return pack_glb(_dump(gltf), binary[:at] + data + binary[at + len(data) :])
+            put(gltf, path, value)
+        return pack_glb(dump(gltf), binary[:at] + data + binary[at + len(data) :])
 
     yield _glb("NaN position", "not_finite", "accessors[0]", patched(offset[0] + 16, FLOAT32_NAN))
     yield _glb("infinite position", "not_finite", "accessors[0]", patched(offset[0], FLOAT32_INF))
@@ -473,7 +379,7 @@ def _data_faults() -> Iterator[Fault]:
         "a position of 3e38 in a mesh used once",
         "overflow",
         "node 'floor' (nodes[0])",
-        patched(offset[0], FLOAT32_HUGE, ("nodes/2/mesh", _REMOVE)),
+        patched(offset[0], FLOAT32_HUGE, ("nodes/2/mesh", REMOVE)),
     )
     place = "meshes[0].primitives[0].indices"
     yield _glb("vertex index out of range", "index_out_of_range", place, patched(offset[3] + 5, b"\x04"))
@@ -491,7 +397,7 @@ def _data_faults() -> Iterator[Fault]:
         data = patched(len(binary), bytes(end - len(binary)) + largest, *edits)
         yield _glb(f"primitive restart in {len(largest) // 3} bytes", "primitive_restart", place, data)
     yield _edit("indices not a multiple of 3", "bad_count", place, ("accessors/3/count", 5))
-    yield _edit("vertices not a multiple of 3", "bad_count", "meshes[0].primitives[0]", ("meshes/0/primitives/0/indices", _REMOVE))
+    yield _edit("vertices not a multiple of 3", "bad_count", "meshes[0].primitives[0]", ("meshes/0/primitives/0/indices", REMOVE))
     yield _edit("a strip of 2", "bad_count", place, ("accessors/3/count", 2), ("meshes/0/primitives/0/mode", 5))
     yield _edit("fewer normals than positions", "count_mismatch", f"{attributes}.NORMAL", ("accessors/1/count", 3))
     yield _edit("fewer colours than positions", "count_mismatch", f"{attributes}.COLOR_0", ("accessors/2/count", 3))
@@ -508,7 +414,7 @@ def _data_faults() -> Iterator[Fault]:
         ("colours of VEC2", "COLOR_0", (("accessors/2/type", "VEC2"),)),
         ("colours of uint", "COLOR_0", (("accessors/2/componentType", 5125),)),
         ("texture coordinates of VEC3", "TEXCOORD_0", (("meshes/0/primitives/0/attributes/TEXCOORD_0", 1),)),
-        ("no data for positions", "POSITION", (("accessors/0/bufferView", _REMOVE),)),
+        ("no data for positions", "POSITION", (("accessors/0/bufferView", REMOVE),)),
     ):
         yield _edit(name, "bad_accessor", f"{attributes}.{accessor}", *wrong)
     floats = (("accessors/3/componentType", 5126), ("accessors/3/count", 1))
@@ -518,7 +424,7 @@ def _data_faults() -> Iterator[Fault]:
     yield _edit("indices of VEC2", "bad_accessor", place, ("accessors/3/type", "VEC2"), ("accessors/3/count", 3))
     yield _edit("normalised indices", "bad_accessor", place, ("accessors/3/normalized", True))
     yield _edit("normalised floats", "bad_accessor", "accessors[0].normalized", ("accessors/0/normalized", True))
-    without = (("accessors/0/bufferView", _REMOVE), ("accessors/0/byteOffset", 4))
+    without = (("accessors/0/bufferView", REMOVE), ("accessors/0/byteOffset", 4))
     yield _edit("an offset into no view", "bad_accessor", "accessors[0].byteOffset", *without)
     for stride in (0, 2, 10, 256, 1 << 40):
         where = "bufferViews[0].byteStride"
@@ -541,7 +447,7 @@ def _data_faults() -> Iterator[Fault]:
 
     inside = "accessors/0/sparse"
     yield sparse_fault("count of 1e9", "out_of_range", "accessors[0].sparse.count", (f"{inside}/count", 10**9))
-    yield sparse_fault("no values", "missing_key", "accessors[0].sparse.values.bufferView", (f"{inside}/values", _REMOVE))
+    yield sparse_fault("no values", "missing_key", "accessors[0].sparse.values.bufferView", (f"{inside}/values", REMOVE))
     yield sparse_fault(
         "view out of range", "index_out_of_range", "accessors[0].sparse.indices.bufferView", (f"{inside}/indices/bufferView", 9)
     )
@@ -559,14 +465,14 @@ def _data_faults() -> Iterator[Fault]:
         *((f"accessors/{i}/count", 2) for i in (1, 2)),
     )
     yield sparse_fault(
-        "a million zeros and more", "too_large", "accessors[0].count", ("accessors/0/bufferView", _REMOVE), ("accessors/0/count", 10**9)
+        "a million zeros and more", "too_large", "accessors[0].count", ("accessors/0/bufferView", REMOVE), ("accessors/0/count", 10**9)
     )
     primitives: Callable[[list[Any]], list[Any]] = lambda old: old * 2_000  # noqa: E731
     w = GlbWriter()
     w.node(mesh=w.mesh("m", [Part([[0, 0, 0]] * 3, [0] * 600_000)]))
     many = w.document()
-    _put(many, "meshes/0/primitives", primitives)
-    yield _glb("one index list 2,000 times", "too_large", "meshes", pack_glb(_dump(many), bytes(w._binary)))
+    put(many, "meshes/0/primitives", primitives)
+    yield _glb("one index list 2,000 times", "too_large", "meshes", pack_glb(dump(many), bytes(w._binary)))
 
 
 def _texture_faults() -> Iterator[Fault]:
@@ -584,8 +490,8 @@ def _texture_faults() -> Iterator[Fault]:
         w.node(mesh=w.mesh("m", [part]))
         document = w.document()
         for path, value in edits:
-            _put(document, path, value)
-        glb = pack_glb(_dump(document), bytes(w._binary))
+            put(document, path, value)
+        glb = pack_glb(dump(document), bytes(w._binary))
         return Fault(name, f"gltf.{slug}", where, {GLB: glb, **(files or {})})
 
     texture = "materials/0/pbrMetallicRoughness/baseColorTexture"
@@ -620,10 +526,10 @@ def _texture_faults() -> Iterator[Fault]:
     ):
         yield of(f"{where} is {value!r}", "wrong_type", where, (path, value))
     yield of("a texture without an index", "missing_key", f"{base}.index", (texture, {}))
-    yield of("an image in a bufferView without a mimeType", "missing_key", "images[0].mimeType", ("images/0/mimeType", _REMOVE))
+    yield of("an image in a bufferView without a mimeType", "missing_key", "images[0].mimeType", ("images/0/mimeType", REMOVE))
     yield of("an image with neither uri nor bufferView", "bad_texture", "images[0]", ("images/0", {}))
     yield of("an image with uri and bufferView", "bad_texture", "images[0]", ("images/0/uri", "a.png"))
-    yield of("a texture without a source", "unsupported_image", "textures[0]", ("textures/0/source", _REMOVE))
+    yield of("a texture without a source", "unsupported_image", "textures[0]", ("textures/0/source", REMOVE))
     basisu = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
     yield of("a texture of KTX2 alone", "unsupported_image", "textures[0]", ("textures/0", basisu))
     yield of("an image of another type", "unsupported_image", "images[0].mimeType", ("images/0/mimeType", "image/webp"))
@@ -631,7 +537,7 @@ def _texture_faults() -> Iterator[Fault]:
     override = (f"{transform}/texCoord", 3)
     yield of("a set that only KHR_texture_transform names", "missing_texcoord", "meshes[0].primitives[0]", override)
     uv = "meshes/0/primitives/0/attributes/TEXCOORD_0"
-    yield of("a textured mesh without coordinates", "missing_texcoord", "meshes[0].primitives[0]", (uv, _REMOVE))
+    yield of("a textured mesh without coordinates", "missing_texcoord", "meshes[0].primitives[0]", (uv, REMOVE))
     for name, data in (
         ("an empty image", b"\0"),
         ("a GIF", b"GIF89a" + bytes(64)),
@@ -682,151 +588,3 @@ def _unsupported() -> Iterator[Fault]:
     yield _edit("morph targets", "unsupported_morph_targets", "meshes[0].primitives[0].targets", targets)
     yield _edit("morph weights of a mesh", "unsupported_morph_targets", "meshes[0].weights", ("meshes/0/weights", [0.5]))
     yield _edit("morph weights of a node", "unsupported_morph_targets", "nodes[0].weights", ("nodes/0/weights", [0.5]))
-
-
-def make_zip(entries: Mapping[str, bytes] | list[tuple[str | zipfile.ZipInfo, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """A zip of these files, in their order, with fixed dates."""
-    out = io.BytesIO()
-    with warnings.catch_warnings(), zipfile.ZipFile(out, "w", method) as archive:
-        # Of names that occur twice, which is what some faults are about.
-        warnings.simplefilter("ignore")
-        for name, data in entries.items() if isinstance(entries, Mapping) else entries:
-            info = name if isinstance(name, zipfile.ZipInfo) else zipfile.ZipInfo(name)
-            info.compress_type = method
-            archive.writestr(info, data)
-    return out.getvalue()
-
-
-def _zip_faults() -> Iterator[Fault]:
-    glb = changed()
-    name = "scene.zip"
-
-    def of(what: str, slug: str, where: str, data: bytes) -> Fault:
-        return Fault(what, slug, where, {name: data}, name)
-
-    sound_zip = make_zip({"room/scene.glb": glb})
-    yield of("a zip without a scene", "scene.no_root", name, make_zip({"readme.txt": b"hello"}))
-    yield of("a zip with two scenes", "scene.no_root", name, make_zip({"a.glb": glb, "b/b.gltf": b"{}"}))
-    yield of("a zip of a Mac's metadata alone", "scene.no_root", name, make_zip({"__MACOSX/._a.glb": glb}))
-    yield of("a zip cut off", "scene.bad_zip", name, sound_zip[:-30])
-    damaged = bytearray(sound_zip)
-    damaged[80] ^= 0xFF
-    yield of("a zip with damaged data", "scene.bad_zip", name, bytes(damaged))
-    for path in ("", "../a.glb", "/a.glb", "a/../b.glb", "a\\b.glb", "C:/a.glb", "a//b.glb", "./a.glb", "a\n.glb"):
-        info = zipfile.ZipInfo("x")
-        info.filename = path
-        yield of(f"a zip with a file called {path!r}", "scene.unsafe_zip", f"{name}: {path!r}", make_zip([(info, glb)]))
-    link = zipfile.ZipInfo("a.glb")
-    link.external_attr = 0o120777 << 16
-    yield of("a zip with a link", "scene.unsafe_zip", f"{name}: 'a.glb'", make_zip([(link, b"/etc/passwd")]))
-    yield of("a zip that holds a name twice", "scene.bad_zip", f"{name}: 'a.glb'", make_zip([("a.glb", glb), ("a.glb", glb)]))
-    yield of("a zip packed by another method", "scene.bad_zip", f"{name}: 'a.glb'", make_zip({"a.glb": glb}, zipfile.ZIP_LZMA))
-    encrypted = bytearray(make_zip({"a.glb": glb}))
-    encrypted[6] |= 1
-    encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
-    yield of("an encrypted zip", "scene.bad_zip", f"{name}: 'a.glb'", bytes(encrypted))
-    yield of("a zip bomb", "scene.zip_too_large", name, make_zip({"a.glb": glb, "b.bin": bytes(1 << 24)}))
-    huge = bytearray(make_zip({"a.glb": glb, "b.bin": b"x"}))
-    at = huge.rindex(b"PK\x01\x02")
-    huge[at + 24 : at + 28] = struct.pack("<I", 0xFFFFFFF0)
-    yield of("a zip that says it holds 4 GiB", "scene.zip_too_large", name, bytes(huge))
-    many = make_zip({"a.glb": glb, **{f"{i}.txt": b"" for i in range(4096)}}, zipfile.ZIP_STORED)
-    yield of("a zip of too many files", "scene.zip_too_large", name, many)
-    lying = bytearray(make_zip({"a.glb": glb}))
-    at = lying.index(b"PK\x01\x02")
-    lying[at + 24 : at + 28] = struct.pack("<I", len(glb) - 8)
-    yield of("a zip with a file longer than it says", "scene.bad_zip", name, bytes(lying))
-    inside = make_zip({"a.glb": changed(("nodes/0/mesh", 99))})
-    yield of("a zip of a bad scene", "gltf.index_out_of_range", "nodes[0].mesh", inside)
-    gltf, binary = sound()
-    gltf["buffers"][0]["uri"] = "../scene.bin"
-    outside = make_zip({"room/scene.gltf": _dump(gltf), "scene.bin": binary})
-    yield of("a zip whose scene looks above its folder", "gltf.unsafe_uri", "buffers[0].uri", outside)
-    yield of("a zip in a zip", "scene.no_root", name, make_zip({"scene.zip": sound_zip}))
-    yield of("a zip of nothing", "scene.no_root", name, make_zip({}))
-    yield of("a zip of folders alone", "scene.no_root", name, make_zip({"room/": b"", "room/textures/": b""}))
-    yield of("a zip of a mesh", "scene.no_root", name, make_zip({"a.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"}))
-    yield of("no zip at all", "scene.bad_zip", name, b"hello")
-    yield of("a zip with a name in no encoding", "scene.bad_zip", name, make_zip({"ä.glb": glb}).replace("ä".encode(), b"\xff\xfe"))
-    for what, magic, offset in (("directory", b"PK\x05\x06", 16), ("file", b"PK\x01\x02", 42)):
-        astray = bytearray(make_zip({"a.glb": glb}))
-        begin = astray.rindex(magic) + offset
-        astray[begin : begin + 4] = struct.pack("<I", 0x7FFFFFFF)
-        yield of(f"a zip whose {what} is not where it says", "scene.bad_zip", f"{name}: 'a.glb'", bytes(astray))
-    overlapping = bytearray(make_zip({"a.glb": glb, "b.bin": b"x" * 100}))
-    begin = overlapping.rindex(b"PK\x01\x02") + 42
-    overlapping[begin : begin + 4] = struct.pack("<I", 0)
-    yield of("a zip of files in one place", "scene.bad_zip", name, bytes(overlapping))
-
-
-def _mesh_faults() -> Iterator[Fault]:
-    def of(what: str, name: str, data: bytes, place: str = "") -> Fault:
-        return Fault(what, "scene.bad_mesh", name + place, {name: data}, name)
-
-    corners = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-    yield of("an empty OBJ", "a.obj", b"")
-    yield of("an OBJ of points", "a.obj", b"v 0 0 0\nv 1 0 0\n")
-    yield of("an OBJ of lines", "a.obj", corners + b"l 1 2 3\n")
-    yield of("an OBJ of NUL bytes", "a.obj", bytes(64))
-    yield of("an OBJ with NaN", "a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    yield of("an OBJ beyond 1e18 m", "a.obj", b"v 0 0 1e30\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    for face in (
-        b"1 2 9",
-        b"1 2 4\nv 1 1 1",
-        b"0 1 2",
-        b"-4 1 2",
-        b"1 2 99999999999999999999",
-        b"1.5 2 3",
-        b"a b c",
-        b"1 2",
-        b"",
-        b"/1 /2 /3",
-    ):
-        yield of(f"an OBJ with the face {face.decode()!r}", "a.obj", corners + b"f " + face, ": line 4")
-    for vertex in (b"0 0", b"x y z", b"", b"1,5 0 0"):
-        yield of(f"an OBJ with the vertex {vertex.decode()!r}", "a.obj", b"v " + vertex + b"\n" + corners + b"f 2 3 4", ": line 1")
-
-    facet = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0)
-
-    def stl(count: int, data: bytes, head: bytes = b"") -> bytes:
-        return head.ljust(80, b"\0") + struct.pack("<I", count) + data
-
-    yield of("an STL of no bytes", "a.stl", b"")
-    yield of("an empty STL", "a.stl", b"solid x\nendsolid x\n")
-    yield of("an STL of nothing", "a.stl", bytes(90))
-    yield of("a binary STL of no triangles", "a.stl", stl(0, b""))
-    yield of("a binary STL cut off", "a.stl", stl(2, facet + facet[:20]))
-    yield of("a binary STL with bytes after its end", "a.stl", stl(1, facet + b"more"))
-    yield of("a binary STL of 2^32 - 1 triangles", "a.stl", stl(2**32 - 1, facet))
-    yield of("a binary STL that begins as ASCII does, cut off", "a.stl", stl(2, facet, b"solid x"))
-    yield of("a binary STL with NaN", "a.stl", stl(1, facet[:12] + FLOAT32_NAN + facet[16:]))
-    loop = b"solid x\nfacet normal 0 0 1\nouter loop\nvertex %s\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid x\n"
-    yield of("an ASCII STL cut off", "a.stl", (loop % b"0 0 0")[:70])
-    yield of("an ASCII STL of words", "a.stl", loop % b"a b c")
-    yield of("a GLB called .stl", "a.stl", changed())
-
-    def ply(vertices: int, faces: int, data: bytes, kind: bytes = b"ascii") -> bytes:
-        head = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\nelement face %d\n"
-        return head % (kind, vertices, faces) + b"property list uchar int vertex_indices\nend_header\n" + data
-
-    triangle = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 %d\n"
-    binary = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + struct.pack("<B3i", 3, 0, 1, 2)
-    little = b"binary_little_endian"
-    yield of("an empty PLY", "a.ply", b"")
-    yield of("a PLY cut in its header", "a.ply", b"ply\nformat ascii 1.0\nelement vertex 3")
-    yield of("a PLY of no known format", "a.ply", ply(3, 1, triangle % 2, b"utf8"))
-    yield of("a PLY of more vertices than it says", "a.ply", ply(2, 1, triangle % 2))
-    yield of("a PLY of fewer vertices than it says", "a.ply", ply(4, 1, triangle % 2))
-    yield of("a PLY of fewer faces than it says", "a.ply", ply(3, 5, triangle % 2))
-    yield of("a PLY of 1e18 vertices", "a.ply", ply(10**18, 1, triangle % 2))
-    yield of("a PLY of no faces", "a.ply", ply(3, 0, (triangle % 2)[:18]))
-    yield of("a PLY that names a vertex too many", "a.ply", ply(3, 1, triangle % 3))
-    yield of("a PLY that names a vertex -1", "a.ply", ply(3, 1, triangle % -1))
-    yield of("a PLY with NaN", "a.ply", ply(3, 1, (triangle % 2).replace(b"0 1 0\n", b"0 nan 0\n", 1)))
-    yield of("a binary PLY cut off", "a.ply", ply(3, 1, binary[:-4], little))
-    yield of("a binary PLY with bytes after its end", "a.ply", ply(3, 1, binary + b"more", little))
-    yield of("a binary PLY with a face of 255 corners", "a.ply", ply(3, 1, binary[:36] + b"\xff" + binary[37:], little))
-    yield of("a PLY of 2e9 vertices", "a.ply", ply(2_000_000_000, 1, binary, little))
-    yield of("a GLB called .ply", "a.ply", changed())
-    yield Fault("a mesh that is not there", "gltf.missing_file", "a.stl", {}, "a.stl", folders=("a.stl",))
-    yield Fault("a scene of no known kind", "gltf.bad_magic", "a.fbx", {"a.fbx": b"Kaydara FBX Binary  \0"}, "a.fbx")

@@ -19,7 +19,8 @@ with atheris.instrument_imports(include=["bake_core"]):
     from bake_core.errors import InputError
     from service import reading
 
-from tests.faults.corpus import changed, corpus
+from tests.faults.corpus import corpus
+from tests.faults.fault import changed
 
 NAMES = ("scene.glb", "scene.gltf", "scene.zip", "scene.obj", "scene.ply", "scene.stl")
 # A child of the service's is limited; in here a mutated count that asks for gigabytes would end the fuzzer instead.

@@ -21,8 +21,8 @@ from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
 from tests.faults.__main__ import summary
-from tests.faults.corpus import changed
 from tests.faults.documents import SKY, SPEC, BundleFault, DocumentFault, bundles, documents
+from tests.faults.fault import changed
 from tests.service.leftovers import listing, own_temporary_files
 from tests.service.running import InProcess
 

@@ -12,7 +12,8 @@ import pytest
 from service.cli import main
 from service.parts import Service
 from service.settings import Settings
-from tests.faults.corpus import Fault, corpus
+from tests.faults.corpus import corpus
+from tests.faults.fault import Fault
 from tests.service.leftovers import listing, own_temporary_files
 from tests.service.running import InProcess
 

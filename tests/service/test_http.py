@@ -16,8 +16,8 @@ import pytest
 from service.jobs import Kind, State
 from service.parts import Service
 from service.settings import Settings
-from tests.faults.corpus import make_zip
 from tests.faults.documents import exr
+from tests.faults.other_files import make_zip
 from tests.service.running import BOX, InProcess, box_spec
 
 HEX = hashlib.sha256(BOX).hexdigest()

@@ -27,7 +27,8 @@ from service.cli import COMMANDS, main, parser
 from service.cli.bake import INTEGRATORS
 from service.cli.progress import ProgressLine, count
 from tests.conformance import synthetic
-from tests.faults.corpus import Fault, corpus
+from tests.faults.corpus import corpus
+from tests.faults.fault import Fault
 
 FEW = {"target_error": None, "max_samples": 4}
 

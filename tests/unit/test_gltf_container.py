@@ -15,7 +15,7 @@ from bake_core.errors import SceneError
 from bake_core.gltf.reader import load_scene, load_scene_files
 from bake_core.gltf.writer import pack_glb
 from bake_core.scene import Scene
-from tests.faults.corpus import changed, sound
+from tests.faults.fault import changed, sound
 
 
 def sha256(data: bytes) -> str:

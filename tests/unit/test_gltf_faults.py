@@ -9,7 +9,8 @@ import pytest
 
 from bake_core.errors import SceneError
 from bake_core.scene_files import load_scene, load_scene_files
-from tests.faults.corpus import Fault, changed, corpus
+from tests.faults.corpus import corpus
+from tests.faults.fault import Fault, changed
 
 FAULTS = corpus()
 

@@ -17,7 +17,7 @@ from bake_core.errors import SceneError
 from bake_core.gltf.reader import load_scene_files
 from bake_core.gltf.writer import pack_glb
 from bake_core.scene import Scene
-from tests.faults.corpus import changed, sound
+from tests.faults.fault import changed, sound
 
 VALUES: tuple[Any, ...] = (
     *(None, True, False, "", "x", "\ud800", "\x00", "../x", [], {}, [[]], [{}], {"a": 1}),

@@ -14,7 +14,8 @@ import trimesh
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.scene import Scene
 from bake_core.scene_files import load_scene, load_scene_files
-from tests.faults.corpus import make_zip, sound
+from tests.faults.fault import sound
+from tests.faults.other_files import make_zip
 from tests.pictures import png
 from tests.unit.gltf_build import TRIANGLE, Raw, world_triangles
 
