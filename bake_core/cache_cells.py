@@ -137,7 +137,7 @@ def average(tracer: Tracer, points: Points, paths: int, grid: F64, *, threads: i
     ----------
     paths : int
         That each point's light is a sum over.
-    grid : (7,) float64
+    grid : (8,) float64
         As :class:`bake_core.light_cache.LightCache` has it.
     """
     tables = tracer.tables._replace(cache=None)

@@ -1,8 +1,7 @@
 """Where the light cache learns: points that probes see, and the light that reaches them.
 
 Points are found where the cache will be read most, by rays from the probes in all directions. At each, paths leave by the cosine, one
-after another of one sequence; a path that meets what an earlier cache knows ends there (as a radiosity solution sweeps over its patches;
-Cohen and Wallace 1993, "Radiosity and Realistic Image Synthesis", section 5.3).
+after another of one sequence; a path that meets what an earlier cache knows ends there.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ class Points:
     def __add__(self, more: Points) -> Points:
         return Points(*(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)))
 
-    def __getitem__(self, which: NDArray[Any]) -> Points:
+    def __getitem__(self, which: NDArray[Any] | slice) -> Points:
         """Some of them, in another order where an order is given."""
         return Points(*(getattr(self, f.name)[which] for f in fields(self)))
 

@@ -36,10 +36,10 @@ class LightCache(NamedTuple):
 
     Attributes
     ----------
-    grid : (7,) float64
-        The grid's lower corner, local frame; the size of the smallest cells, metres; how many sizes there are; and the first and the last
+    grid : (8,) float64
+        The grid's lower corner, local frame; the size of the smallest cells, metres; how many sizes there are; the first and the last
         vertex of a path that it answers at: where bounces are limited that is only one, for what is known of light that bounces so often
-        is not what is asked for after another bounce.
+        is not what is asked for after another bounce; and how many times its size a cell must be away from where a ray comes from.
     table : (2^k, 2) uint64
         A hash table with linear probing (Knuth 1998, "The Art of Computer Programming" 3, section 6.4): :func:`cell_key`, or NONE where
         it is empty, and the row of the cell.
@@ -57,7 +57,7 @@ class LightCache(NamedTuple):
 
 def empty_cache(scrambles: int) -> LightCache:
     """A cache that knows nothing."""
-    return LightCache(np.zeros(7), np.full((1, 2), NONE), np.zeros((0, 3)), np.zeros((0, scrambles, 3), np.float32))
+    return LightCache(np.zeros(8), np.full((1, 2), NONE), np.zeros((0, 3)), np.zeros((0, scrambles, 3), np.float32))
 
 
 @kernel
@@ -112,14 +112,15 @@ def sees_middle(t, ray, ray_bits, p, n, epsilon, middle):  # type: ignore[no-unt
     return not blocked(t, ray, ray_bits, x, y, z, middle[0] - x, middle[1] - y, middle[2] - z, np.float32(1))
 
 
-def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon):  # type: ignore[no-untyped-def]
+def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon, d2):  # type: ignore[no-untyped-def]
     c = t.cache
     if c.grid[5] <= depth <= c.grid[6]:
         i, j, k, within = cell_of(c.grid, p)
         way = facing(n[3], n[4], n[5])
         for level in range(int(c.grid[4]) if within else 0):
             place, found = find(c.table, cell_key(i, j, k, way, level))
-            if found:
+            near = c.grid[7] * c.grid[3] * 2.0**level
+            if found and d2 >= near * near:
                 cell = c.table[place, 1]
                 if sees_middle(t, ray, ray_bits, p, n, epsilon, c.middle[cell]):
                     light = c.light[cell, scramble]
@@ -127,6 +128,6 @@ def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon):  # type: ignore[n
     return False, 0.0, 0.0, 0.0
 
 
-# What a scramble's cache knows of the light at a vertex (t, ray, ray_bits, scramble, depth, point, normals, epsilon): whether it does, and
-# red, green, blue.
-cached_light = either("cache")(_cached)(lambda t, ray, ray_bits, scramble, depth, p, n, epsilon: (False, 0.0, 0.0, 0.0))
+# What a scramble's cache knows of the light at a vertex (t, ray, ray_bits, scramble, depth, point, normals, epsilon, squared length of the
+# ray that met it): whether it does, and red, green, blue.
+cached_light = either("cache")(_cached)(lambda t, ray, ray_bits, scramble, depth, p, n, epsilon, d2: (False, 0.0, 0.0, 0.0))

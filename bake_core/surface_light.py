@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,13 @@ Flag = NDArray[np.uint8]
 _SHARE = 0.5
 # From one point in the first stage: its ray from the probe costs little beside them.
 _PATHS = 16
+# Of a layer that only teaches the next one, so many times fewer: where bounces are limited and there are many such layers, whose noise is
+# averaged over all that a point sees; and where there is one in the first stage alone, whose light all later ones go on with.
+_TEACHING_MANY, _TEACHING_ONE = 8, 2
+# What it learns from ends in cells of the layer below that are this many times their size away, or more.
+_FAR = 3.0
+# Where bounces are limited, every one has a layer of its own, but for the first of more than so many: those are path-traced.
+_MOST_LAYERS = 6
 # Probes that points are looked for from, and points in the end: what a large bake holds of them, some 600 MB.
 _MOST_PROBES, _MOST_POINTS = 1 << 14, 1 << 21
 # The smallest cells of the first stage, in the smallest spacing of probes; how many sizes there are up to the largest spacing.
@@ -35,7 +41,7 @@ FEWEST_PROBES = 64
 # Of what probes see, this much must be in the cache for it to pay.
 _COVERED = 0.5
 # A point twice, while cells are made of it; a cell with its place in the table, in all sizes together.
-_POINT_BYTES, _CELL_BYTES = 2 * 114, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
+_POINT_BYTES, _LIGHT_BYTES, _CELL_BYTES = 2 * 90, 2 * 24, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
 _SEED = 0x11C4C3E5
 
 
@@ -45,7 +51,12 @@ class SurfaceLight:
 
     Stage s is what a bake of 16 · 2ˢ samples learns from: half as many paths as it traces itself, from points that its probes see. Both
     the points and the paths from each grow, and every second stage cells are half as large, so that what they smooth away goes to zero
-    as well. In the first stage a quarter of the points are path-traced to their ends, and the others' paths end in those.
+    as well.
+
+    Light is learnt in layers. Paths of the lowest are traced to their ends; those of the next one end at the first surface that the layer
+    below knows, as a sweep of a radiosity solution does (Cohen and Wallace 1993, "Radiosity and Realistic Image Synthesis", section 5.3).
+    Where bounces are limited, a layer knows light of so many of them, and the highest, of one less than a path may have, is what the
+    bake reads. Where they are not, there are two of the same light, and from the second stage on the one before is the lower one.
 
     ``dataclasses.replace`` makes one of another seed or tracer, that has learnt nothing yet.
 
@@ -127,7 +138,7 @@ class SurfaceLight:
     def bytes(self, samples: int) -> int:
         """What is held at most, once so many samples have been taken."""
         points = self.probes * SCRAMBLES * self.rounds(_stage(samples))
-        return points * (_POINT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
+        return points * (_POINT_BYTES + len(self._bounces) * _LIGHT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
 
     def blank(self) -> Tracer:
         """The tracer with a cache that knows nothing: for kernels that are to be compiled, and who starts to learn."""
@@ -143,41 +154,48 @@ class SurfaceLight:
     def forget(self) -> None:
         """Hold nothing any more; whoever asks again has it learnt anew."""
         self._learnt, self._points, self._cached = -1, Points.none(), self.blank()
+        self._light = [np.zeros((0, 3)) for _ in self._bounces]
         self._rays: list[int] = []
 
-    def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:
-        paths, rounds = self.paths(stage), [0, self.rounds(stage)]
-        points = replace(self._points, light=self._points.light.copy())
-        grid, tracer, rays = self._grid(stage), self._teacher(), 0
-        if stage:
-            rounds[0] = self.rounds(stage - 1)
-            rays += gather_light(tracer, points, (self.paths(stage - 1), paths), threads=threads, cancelled=cancelled)
-        elif not self._limited and rounds[1] > 3:
-            rounds.insert(1, rounds[1] // 4)
-        for part in pairwise(rounds):
-            if len(points) and not stage:
-                cache, traced = average(self.tracer, points, paths, grid, threads=threads)
-                tracer, rays = _teaching(_with(self.tracer, cache)), rays + traced
-            found = find_points(self.tracer, self._positions, part, self._seed, threads=threads, cancelled=cancelled)
-            rays += found.rays + gather_light(tracer, found.points, (0, paths), threads=threads, cancelled=cancelled)
-            points = points + found.points
-        cache, traced = average(self.tracer, points, paths, grid, threads=threads)
-        self._learnt, self._points, self._cached = stage, points, _with(self.tracer, cache)
-        self._rays.append(rays + traced)
-
-    def _teacher(self) -> Tracer:
-        """What paths from points are traced with: a cache ends them, unless it knows of one bounce too many."""
+    @property
+    def _bounces(self) -> list[np.int64]:
+        """Of the light that each layer knows, the lowest first."""
+        most = self.tracer.tables.max_bounces
         if not self._limited:
-            return _teaching(self._cached)
-        blank = self.blank()
-        return replace(blank, tables=blank.tables._replace(max_bounces=np.int64(blank.tables.max_bounces - 1)))
+            return [most, most]
+        return [np.int64(bounces) for bounces in range(max(int(most) - _MOST_LAYERS, 1), int(most))]
+
+    def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:
+        bounces, grid = self._bounces, self._grid(stage)
+        before, now = self.rounds(stage - 1) if stage else 0, self.rounds(stage)
+        found = find_points(self.tracer, self._positions, (before, now), self._seed, threads=threads, cancelled=cancelled)
+        old, points, rays = len(self._points), self._points + found.points, found.rays
+        # Without limits the last stage knows of the same light, and better than a lower layer would.
+        lowest = 1 if stage and not self._limited else 0
+        light, known = [*self._light], self._cached if lowest else _bounded(self.blank(), bounces[0])
+        for layer in range(lowest, len(bounces)):
+            teacher = _teaching(known)
+            light[layer] = np.concatenate([self._light[layer], np.zeros((len(points) - old, 3))])
+            # Paths of its own.
+            of_layer = replace(points, key=points.key ^ np.uint64(len(bounces) - 1 - layer), light=light[layer])
+            paths = self.paths(stage, layer)
+            for part, first in ((slice(old), self.paths(stage - 1, layer) if stage else 0), (slice(old, None), 0)):
+                rays += gather_light(teacher, of_layer[part], (first, paths), threads=threads, cancelled=cancelled)
+            cache, traced = average(self.tracer, of_layer, paths, grid, threads=threads)
+            known, rays = _bounded(_with(self.tracer, cache), bounces[layer] + self._limited), rays + traced
+        self._learnt, self._points, self._light, self._cached = stage, points, light, known
+        self._rays.append(rays)
 
     def rounds(self, stage: int) -> int:
         """Points of each probe and scramble; the paths from each make up for the stages in which they do not grow."""
         return min(max(self._first_paths // _PATHS, 1) << ((stage + 1) // 2), self._most_rounds)
 
-    def paths(self, stage: int) -> int:
-        return max((self._first_paths << stage) // self.rounds(stage), 1)
+    def paths(self, stage: int, layer: int = -1) -> int:
+        """From each point, of a layer; of the highest, which is what is read, if none is given."""
+        paths = (self._first_paths << stage) // self.rounds(stage)
+        if layer not in (-1, len(self._bounces) - 1):
+            paths //= _TEACHING_MANY if self._limited else _TEACHING_ONE
+        return max(paths, 1)
 
     def _grid(self, stage: int) -> F64:
         smallest = self._smallest * _SMALLEST / 2 ** (stage // 2)
@@ -185,7 +203,7 @@ class SurfaceLight:
         middle = (self._positions.min(0) + self._positions.max(0)) / 2
         # Not a multiple of anything, lest walls lie on the edges of cells.
         corner = middle - (AXIS_CELLS / 2 + 0.37) * smallest
-        return np.array([*corner, smallest, min(sizes, _MOST_SIZES), 1, 1 if self._limited else np.inf], np.float64)
+        return np.array([*corner, smallest, min(sizes, _MOST_SIZES), 1, 1 if self._limited else np.inf, 0], np.float64)
 
 
 def _stage(samples: int) -> int:
@@ -207,10 +225,14 @@ def surface_light(spec: Spec, tracer: Tracer, positions: F64, units: F64, texels
 
 
 def _teaching(tracer: Tracer) -> Tracer:
-    """With a cache that answers from the second surface on: what it smooths at the first would add to what it smooths itself."""
+    """With a cache that does not answer beside where it is asked from: what it smooths there would be seen at large, and smoothed again."""
     cache = tracer.tables.cache
     assert cache is not None
-    return _with(tracer, cache._replace(grid=np.array([*cache.grid[:5], 2, cache.grid[6]])))
+    return _with(tracer, cache._replace(grid=np.array([*cache.grid[:7], _FAR])))
+
+
+def _bounded(tracer: Tracer, bounces: np.int64) -> Tracer:
+    return replace(tracer, tables=tracer.tables._replace(max_bounces=np.int64(bounces)))
 
 
 def _with(tracer: Tracer, cache: LightCache) -> Tracer:

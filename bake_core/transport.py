@@ -195,7 +195,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
                     indirect_g += beta_g / survival * g
                     indirect_b += beta_b / survival * b
         if not glossy:
-            known, r, g, b = cached_light(t, ray, ray_bits, scramble, depth, p, n, epsilon)
+            known, r, g, b = cached_light(t, ray, ray_bits, scramble, depth, p, n, epsilon, hx * hx + hy * hy + hz * hz)
             if known:
                 indirect_r += beta_r / survival * r
                 indirect_g += beta_g / survival * g

@@ -47,7 +47,7 @@ def test_every_way_to_face_is_one_of_54_and_an_axis_is_the_middle_of_its_side() 
 
 def test_points_of_one_cell_stand_together_in_every_size() -> None:
     random = np.random.default_rng(1)
-    grid = np.array([-3.0, 2.0, 10.0, 0.01, 6, 1, np.inf])
+    grid = np.array([-3.0, 2.0, 10.0, 0.01, 6, 1, np.inf, 0])
     place = np.zeros((500, 10))
     place[:, :3] = grid[:3] + random.random((500, 3)) * 0.3
     way = random.integers(0, 2, 500).astype(np.uint8)
@@ -60,7 +60,7 @@ def test_points_of_one_cell_stand_together_in_every_size() -> None:
 
 
 def test_beyond_the_grid_nothing_is_known() -> None:
-    grid = np.array([0.0, 0, 0, 1, 4, 1, np.inf])
+    grid = np.array([0.0, 0, 0, 1, 4, 1, np.inf, 0])
     assert cell_of(grid, (0.5, AXIS_CELLS - 0.5, 3.0)) == (0, AXIS_CELLS - 1, 3, True)
     for p in ((-0.1, 0.0, 0.0), (0.0, AXIS_CELLS + 0.5, 0.0), (0.0, 0.0, 1e30), (-1e30, 0.0, 0.0)):
         assert not cell_of(grid, p)[3]
