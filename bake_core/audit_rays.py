@@ -18,6 +18,7 @@ from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.filtering import VISIBILITY_SHARPNESS
 from bake_core.kernels import CANCELLED, DONE, either, entry_kernel, kernel
+from bake_core.light_tree import pick_emitter
 from bake_core.next_event import sample_emitter
 from bake_core.sampling import basis, mix64, reverse_bits, sobol_pair
 from bake_core.surfaces import INFINITE, blocked, find_surface, surface
@@ -126,8 +127,8 @@ def _sphere_kernel(t, ray, positions, normals, first, samples, seed, cancelled, 
                 _add(normals, gain / _UNIFORM_PDF, radiance, d, into)
                 if t.emitters.cdf.shape[0]:
                     a, b = sobol_pair(reversed_index, light_key)
-                    choice, _ = sobol_pair(reversed_index, light_key + uint64(1))
-                    le, w, pdf, end = sample_emitter(t, x, y, z, a, b, choice)
+                    emitter, chance, rest = pick_emitter(t, (x, y, z), np.float64(a))
+                    le, w, pdf, end = sample_emitter(t, x, y, z, emitter, chance, np.float32(rest), b)
                     if pdf > 0 and not blocked(t, ray, ray_bits, x, y, z, end[0] - x, end[1] - y, end[2] - z, np.float32(1)):
                         _add(normals, gain / (_UNIFORM_PDF + pdf), le, w, into)
                 if has_sky(t):

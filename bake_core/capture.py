@@ -21,6 +21,7 @@ from bake_core.embree import new_rayhit, rays_traced
 from bake_core.environment import has_sky, sample_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import CANCELLED, DONE, either, entry_kernel, kernel
+from bake_core.light_tree import pick_emitter
 from bake_core.next_event import sample_emitter
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
@@ -38,6 +39,8 @@ BLOCKS = 4
 # Emitters and sky seen directly are also sampled as lights, once for this many capture texels: a capture ray either hits a lamp or misses
 # it, and the edge of a 1 m² lamp 1 m away costs 0.2 % of irradiance at 256 samples; with one shadow ray to four paths it costs 0.05 %.
 _TEXELS_PER_LIGHT_SAMPLE = 4
+# Of radiance only lights that are so much denser sampled this way are: a texel that a lamp fills has no error but that of their number.
+_RADIANCE_CUTOFF = 4.0
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
 
@@ -61,28 +64,55 @@ def _capture_density(d, texels):  # type: ignore[no-untyped-def]
     return texels / 4 * (reach * reach * reach)
 
 
-def _add_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes):  # type: ignore[no-untyped-def]
+@kernel
+def _capture_texel(d, texels):  # type: ignore[no-untyped-def]
+    """Which one a unit direction leads through: that of :func:`bake_core.octahedral.dir_to_oct`."""
+    resolution = round(math.sqrt(texels))
+    reach = 1 / (abs(d[0]) + abs(d[1]) + abs(d[2]))
+    x, y = d[0] * reach, d[1] * reach
+    if d[2] < 0:
+        x, y = math.copysign(1 - abs(y), x), math.copysign(1 - abs(x), y)
+    row, column = int((y + 1) / 2 * resolution), int((x + 1) / 2 * resolution)
+    return min(row, resolution - 1) * resolution + min(column, resolution - 1)
+
+
+@kernel
+def _add_sample(radiance, d, pdf, texels, rate, normals, lanes, seen):  # type: ignore[no-untyped-def]
+    """Light that was drawn in a direction, into irradiance and into the capture texel there; the balance heuristic's share of it."""
+    density = _capture_density(d, texels)
+    gain = 1 / (density + rate * pdf)
+    _add_light(gain, radiance, d, normals, lanes)
+    if seen.shape[0] and rate * pdf > _RADIANCE_CUTOFF * density:
+        texel = _capture_texel(d, texels)
+        seen[texel, 0] += density * gain * radiance[0]
+        seen[texel, 1] += density * gain * radiance[1]
+        seen[texel, 2] += density * gain * radiance[2]
+
+
+def _add_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes, seen):  # type: ignore[no-untyped-def]
     radiance, d, pdf = sample_sky(t.sky, np.float64(u), np.float64(v))
     if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], d[0], d[1], d[2], INFINITE):
-        _add_light(1 / (_capture_density(d, texels) + rate * pdf), radiance, d, normals, lanes)
+        _add_sample(radiance, d, pdf, texels, rate, normals, lanes, seen)
     return True
 
 
 # One sample of the sky, where there is one.
-_add_sample_of_sky = either("sky")(_add_sky)(lambda t, ray, ray_bits, position, u, v, texels, rate, normals, lanes: False)
+_add_sample_of_sky = either("sky")(_add_sky)(lambda t, ray, ray_bits, position, u, v, texels, rate, normals, lanes, seen: False)
 
 
 @kernel
-def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance):  # type: ignore[no-untyped-def]
-    """Irradiance straight from emitters and sky, one sample of each a round; its weight is what the balance heuristic leaves to it.
+def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key, normals, lanes, irradiance, seen):  # type: ignore[no-untyped-def]
+    """What comes straight from emitters and sky, one sample of each a round; its weight is what the balance heuristic leaves to it.
 
     Parameters
     ----------
     rounds : (int, int)
-        Half-open range of points of this scramble's sequence; one a round.
+        Half-open range of points of the half's sequence; one a round.
     rate : float
         Light samples a round over the whole probe.
     irradiance : (3, m) float64, added to
+    seen : (texels, 3) or (0, 3) float64, added to
+        Radiance of capture texels, where it is kept.
     """
     m = normals.shape[1]
     for i in range(m):
@@ -92,13 +122,14 @@ def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key,
         reversed_index = reverse_bits(uint32((point * texels + texel) // _TEXELS_PER_LIGHT_SAMPLE))
         u, v = sobol_pair(reversed_index, key)
         if t.emitters.cdf.shape[0]:
-            choice, _ = sobol_pair(reversed_index, key + uint64(1))
-            le, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], u, v, choice)
+            # The number that picks the emitter goes on to place the point on it: all emitters together are stratified as one square.
+            emitter, chance, rest = pick_emitter(t, position, np.float64(u))
+            le, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], emitter, chance, np.float32(rest), v)
             x, y, z = end[0] - position[0], end[1] - position[1], end[2] - position[2]
             if pdf > 0 and not blocked(t, ray, ray_bits, position[0], position[1], position[2], x, y, z, np.float32(1)):
-                _add_light(1 / (_capture_density(d, texels) + rate * pdf), le, d, normals, lanes)
+                _add_sample(le, d, pdf, texels, rate, normals, lanes, seen)
         # Emitters and sky may share their numbers: each sum stays unbiased.
-        _add_sample_of_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes)
+        _add_sample_of_sky(t, ray, ray_bits, position, u, v, texels, rate, normals, lanes, seen)
     for i in range(m):
         irradiance[0, i] += lanes[0, i]
         irradiance[1, i] += lanes[1, i]
@@ -115,9 +146,9 @@ def _morton(row, column):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _points_of(span, j):  # type: ignore[no-untyped-def]
-    """The half-open range of points of the sequence of scramble j of a half that its samples [span[0], span[1]) are."""
-    return (span[0] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF, (span[1] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF
+def _count(span, j):  # type: ignore[no-untyped-def]
+    """How many of a half's samples [span[0], span[1]) are of its scramble j."""
+    return (span[1] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF - (span[0] - j + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF
 
 
 @entry_kernel
@@ -137,12 +168,12 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
         Exact ∫ cosθ dω over each capture texel about each normal.
     blocks : (int, int)
         Half-open range out of BLOCKS.
-    room : (SCRAMBLES_PER_HALF + 1, 4, m) float32, (SCRAMBLES_PER_HALF, 4) float64
+    room : (SCRAMBLES + 1, 4, m) float32, (HALVES, 3) float64
         To work in.
     irradiance : (p, BLOCKS, SCRAMBLES, 3, m) float64, added to
         Σ L cosθ · (solid angle per sample), per block and scramble.
-    radiance : (p, HALVES, resolution², 3) float64 or (0, 0, 0, 0), added to
-        Σ L per half and capture texel.
+    radiance : (p, BLOCKS, HALVES, resolution², 3) float64 or (p, BLOCKS, HALVES, 0, 3), added to
+        Σ L per block, half and capture texel: a block's light samples fall into any.
 
     Notes
     -----
@@ -157,9 +188,9 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
 
     the samples' own convolution, corrected for where in the texel they happened to fall. With a coefficient L̄ from the scramble's own
     samples, one sample would be left with L F and no knowledge of how light and cosine go together inside the texel. L̄ is therefore the
-    mean over the other scrambles of the same half (cross-fitting; Avramidis and Wilson 1993, "A Splitting Scheme for Control Variates"):
-    independent of mean_i(f), whose mean is F, so nothing biases the sum, at any number of samples. Where L is constant it is exact (a
-    furnace tests it). Scrambles are no longer quite independent: the covariance of two is the square of one sample's cov(L, f) over 3².
+    other half's mean (cross-fitting; Avramidis and Wilson 1993, "A Splitting Scheme for Control Variates"): independent of mean_i(f), whose
+    mean is F, so nothing biases the sum, at any number of samples; where this pass has none of the other half it is 0. Where L is constant
+    the sum is exact (a furnace tests it). Halves are no longer quite independent: the covariance of two is the square of one's cov(L, f).
     """
     ray_bits = ray.view(np.uint32)
     lanes, light = room
@@ -178,22 +209,24 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
             place = _morton(row, column)
             block = texel * BLOCKS // texels
             for half in range(HALVES):
-                total_r = total_g = total_b = 0.0
-                drawn = 0.0
+                light[half, 0] = light[half, 1] = light[half, 2] = 0.0
+                key = mix64(probe_key + uint64(texel * HALVES + half))
+                path_key = mix64(probe_key + uint64((texels + 1) * HALVES + half))
+                begun, span = spans[p, half, 0], spans[p, half, 1] - spans[p, half, 0]
+                sample = 0
                 for j in range(SCRAMBLES_PER_HALF):
                     scramble = half * SCRAMBLES_PER_HALF + j
-                    key = mix64(probe_key + uint64(texel * SCRAMBLES + scramble))
-                    path_key = mix64(probe_key + uint64((texels + 1) * SCRAMBLES + scramble))
+                    own = lanes[scramble]
                     for i in range(m):
-                        lanes[j, 0, i] = lanes[j, 1, i] = lanes[j, 2, i] = lanes[j, 3, i] = np.float32(0)
-                    sum_r = sum_g = sum_b = 0.0
-                    first, end = _points_of(spans[p, half], j)
-                    for point in range(first, end):
-                        u, v = sobol_pair(reverse_bits(uint32(point)), key)
+                        own[0, i] = own[1, i] = own[2, i] = own[3, i] = np.float32(0)
+                    for _ in range(_count(spans[p, half], j)):
+                        # A half's scrambles share out the points of one sequence: each has a run of those of this pass.
+                        u, v = sobol_pair(reverse_bits(uint32(begun + sample)), key)
                         # Bounces are stratified over the whole probe: one sequence for all its texels, of which a texel's samples of one
                         # pass are a run, and neighbouring texels' runs follow one another.
-                        index = uint32(texels * first + place * (end - first) + point - first)
+                        index = uint32(texels * begun + place * span + sample)
                         reversed_index = reverse_bits(index)
+                        sample += 1
                         a = (column + float(u)) * 2 / resolution - 1
                         b = (row + float(v)) * 2 / resolution - 1
                         c = 1 - abs(a) - abs(b)
@@ -207,58 +240,57 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
                         emitted, direct, indirect, _, light_pdf = trace_path(
                             t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, path_key, False, width, scramble
                         )
-                        red, green, blue = (
-                            emitted[0] + direct[0] + indirect[0],
-                            emitted[1] + direct[1] + indirect[1],
-                            emitted[2] + direct[2] + indirect[2],
-                        )
-                        if radiance.shape[0]:
-                            radiance[p, half, texel, 0] += red
-                            radiance[p, half, texel, 1] += green
-                            radiance[p, half, texel, 2] += blue
-                        solid_angle = np.float32(1 / density)
                         # What light samples find too, they find better: the balance heuristic leaves this sample its share.
                         share = density / (density + light_rate * light_pdf)
-                        red, green, blue = red - (1 - share) * emitted[0], green - (1 - share) * emitted[1], blue - (1 - share) * emitted[2]
-                        sum_r += red
-                        sum_g += green
-                        sum_b += blue
+                        red = share * emitted[0] + direct[0] + indirect[0]
+                        green = share * emitted[1] + direct[1] + indirect[1]
+                        blue = share * emitted[2] + direct[2] + indirect[2]
+                        if radiance.shape[3]:
+                            rest = 1 - share if light_rate * light_pdf <= _RADIANCE_CUTOFF * density else 0.0
+                            radiance[p, block, half, texel, 0] += red + rest * emitted[0]
+                            radiance[p, block, half, texel, 1] += green + rest * emitted[1]
+                            radiance[p, block, half, texel, 2] += blue + rest * emitted[2]
+                        light[half, 0] += red
+                        light[half, 1] += green
+                        light[half, 2] += blue
+                        solid_angle = np.float32(1 / density)
                         fr, fg, fb = np.float32(red), np.float32(green), np.float32(blue)
                         fx, fy, fz = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
                         for i in range(m):
                             f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
-                            lanes[j, 0, i] += f * fr
-                            lanes[j, 1, i] += f * fg
-                            lanes[j, 2, i] += f * fb
-                            lanes[j, 3, i] += f
-                    light[j, 0], light[j, 1], light[j, 2], light[j, 3] = sum_r, sum_g, sum_b, end - first
-                    total_r += sum_r
-                    total_g += sum_g
-                    total_b += sum_b
-                    drawn += end - first
+                            own[0, i] += f * fr
+                            own[1, i] += f * fg
+                            own[2, i] += f * fb
+                            own[3, i] += f
+            for half in range(HALVES):
+                other = HALVES - 1 - half
+                drawn = spans[p, other, 1] - spans[p, other, 0]
+                if drawn == 0 and spans[p, other, 1] == 0:
+                    # The only sample of all has nobody else to ask.
+                    other, drawn = half, spans[p, half, 1]
+                per = 1 / drawn if drawn > 0 else 0.0
+                mean_r, mean_g, mean_b = (
+                    np.float32(per * light[other, 0]),
+                    np.float32(per * light[other, 1]),
+                    np.float32(per * light[other, 2]),
+                )
+                light_key = mix64(probe_key + uint64(texels * HALVES + half))
+                point = spans[p, half, 0]
                 for j in range(SCRAMBLES_PER_HALF):
-                    if light[j, 3] == 0:
-                        continue
                     scramble = half * SCRAMBLES_PER_HALF + j
-                    if total_r + total_g + total_b > 0:
-                        # A scramble that is alone has nobody else to ask.
-                        others = drawn - light[j, 3]
-                        own = 1.0 if others > 0 else 0.0
-                        per = 1 / (others if others > 0 else drawn)
-                        mean_r = np.float32((total_r - own * light[j, 0]) * per)
-                        mean_g = np.float32((total_g - own * light[j, 1]) * per)
-                        mean_b = np.float32((total_b - own * light[j, 2]) * per)
-                        weight = np.float32(light[j, 3])
-                        for i in range(m):
-                            missed = weight * cosines[texel, i] - lanes[j, 3, i]
-                            irradiance[p, block, scramble, 0, i] += lanes[j, 0, i] + mean_r * missed
-                            irradiance[p, block, scramble, 1, i] += lanes[j, 1, i] + mean_g * missed
-                            irradiance[p, block, scramble, 2, i] += lanes[j, 2, i] + mean_b * missed
+                    count = _count(spans[p, half], j)
+                    own, into = lanes[scramble], irradiance[p, block, scramble]
+                    weight = np.float32(count)
+                    for i in range(m):
+                        missed = weight * cosines[texel, i] - own[3, i]
+                        into[0, i] += own[0, i] + mean_r * missed
+                        into[1, i] += own[1, i] + mean_g * missed
+                        into[2, i] += own[2, i] + mean_b * missed
                     if light_rate and texel % _TEXELS_PER_LIGHT_SAMPLE == 0:
-                        light_key = mix64(probe_key + uint64(texels * SCRAMBLES + scramble))
-                        rounds = _points_of(spans[p, half], j)
-                        into, spare = irradiance[p, block, scramble], lanes[SCRAMBLES_PER_HALF]
-                        _sample_lights(t, ray, ray_bits, (x0, y0, z0), texel, texels, rounds, light_rate, light_key, normals, spare, into)
+                        rounds, spare, seen = (point, point + count), lanes[SCRAMBLES], radiance[p, block, half]
+                        at = (x0, y0, z0)
+                        _sample_lights(t, ray, ray_bits, at, texel, texels, rounds, light_rate, light_key, normals, spare, into, seen)
+                    point += count
     return DONE
 
 
@@ -346,9 +378,10 @@ def capture_radiance(
     irradiance = np.zeros((n, SCRAMBLES, normals.shape[1], 3))
     radiance = np.zeros((n, HALVES, capture.resolution**2, 3) if capture.keep_radiance else (0, 0, 0, 0))
 
-    def trace(first: int, end: int, blocks: tuple[int, int]) -> tuple[F64, int]:
+    def trace(first: int, end: int, blocks: tuple[int, int]) -> tuple[F64, F64, int]:
         ray = new_rayhit()
         sums = np.zeros((end - first, BLOCKS, SCRAMBLES, 3, normals.shape[1]))
+        seen = np.zeros((end - first, BLOCKS, HALVES, capture.resolution**2 if capture.keep_radiance else 0, 3))
         status = _capture_kernel(
             tracer.tables,
             ray,
@@ -361,30 +394,35 @@ def capture_radiance(
             cosines,
             np.uint64(capture.seed),
             cancelled,
-            (np.zeros((SCRAMBLES_PER_HALF + 1, 4, normals.shape[1]), np.float32), np.zeros((SCRAMBLES_PER_HALF, 4))),
+            (np.zeros((SCRAMBLES + 1, 4, normals.shape[1]), np.float32), np.zeros((HALVES, 3))),
             sums,
-            radiance[first:end],
+            seen,
         )
         if status == CANCELLED:
             raise Cancelled
-        return sums, rays_traced(ray)
+        return sums, seen, rays_traced(ray)
+
+    def gather(first: int, end: int, sums: F64, seen: F64) -> None:
+        irradiance[first:end] = np.moveaxis(_sum_blocks(sums), -2, -1)
+        if capture.keep_radiance:
+            radiance[first:end] = _sum_blocks(seen)
 
     def trace_probes(first: int, end: int) -> int:
-        sums, rays = trace(first, end, (0, BLOCKS))
-        irradiance[first:end] = _sum_blocks(sums)
+        sums, seen, rays = trace(first, end, (0, BLOCKS))
+        gather(first, end, sums, seen)
         advance((end - first) / n)
         return rays
 
-    def trace_block(block: int) -> tuple[F64, int]:
-        sums, rays = trace(0, n, (block, block + 1))
+    def trace_block(block: int) -> tuple[F64, F64, int]:
+        sums, seen, rays = trace(0, n, (block, block + 1))
         advance(1 / BLOCKS)
-        return sums[:, block], rays
+        return sums[:, block], seen[:, block], rays
 
     with ThreadPoolExecutor(threads) as pool:
         if n < 4 * threads:
             # Too few probes to share out: share each probe's blocks.
-            blocks, counts = zip(*pool.map(trace_block, range(BLOCKS)), strict=True)
-            irradiance[:] = _sum_blocks(np.stack(blocks, 1))
+            sums, seen, counts = zip(*pool.map(trace_block, range(BLOCKS)), strict=True)
+            gather(0, n, np.stack(sums, 1), np.stack(seen, 1))
             rays = sum(counts)
         else:
             # Small enough that threads end together, large enough that Python's part is nothing.
@@ -404,11 +442,11 @@ def _irradiance_filter(resolution: int, irradiance_resolution: int) -> tuple[F32
 
 
 def _sum_blocks(sums: F64) -> F64:
-    """In one fixed order; colours, which kernels keep apart, last."""
+    """In one fixed order."""
     total: F64 = sums[:, 0]
     for block in range(1, BLOCKS):
         total = total + sums[:, block]
-    return np.moveaxis(total, -2, -1)
+    return total
 
 
 def capture_distance(

@@ -1,7 +1,9 @@
 """How wrong a bake still is, and when it stops.
 
-The spread of independent scrambles gives each irradiance texel's standard error (Owen 1997, "Monte Carlo Variance of Scrambled Net
-Quadrature": replicates of a scrambled sequence are independent and unbiased). DESIGN's figure puts them together:
+The spread of scrambles gives each irradiance texel's standard error (Owen 1997, "Monte Carlo Variance of Scrambled Net Quadrature").
+Those of one half share out the points of one sequence between them, so that the half errs less than as many independent ones would. How
+much less, its difference from the other half says, whose sequence is another: one number a probe, but one for the whole bake is well known
+from all of its probes (a ratio estimate; Cochran 1977, "Sampling Techniques", chapter 6). DESIGN's figure puts them together:
 
     error = 95 % upper bound of √mean(|ΔE|² / (E² + (0.05 Ē)²)) over irradiance texels of active probes
 """
@@ -10,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +31,8 @@ _Z95 = 1.6448536269514722
 # A pass that is shortened is a multiple of this: each scramble gets as many samples.
 SMALLEST_PASS = SCRAMBLES
 _PROBES_AT_ONCE = 512
+# Where fewer probes than these have most of the variance, nobody knows how much less than their scrambles their halves vary.
+_FEWEST_PROBES = 16
 
 Verdict = Literal["continue", "target", "samples", "time", "interrupt"]
 
@@ -115,11 +119,17 @@ class Spread:
         Of texels: the estimate's square and its variance, summed over colours.
     degrees : int
         Of freedom, of each variance.
+    ratio : float
+        What `variance` has already been multiplied by: how much less two halves differ than their scrambles say, 1 at most.
+    doubt : float
+        By how much more that may be, a factor: its own 95 % bound.
     """
 
     square: F64
     variance: F64
     degrees: int
+    ratio: float = 1.0
+    doubt: float = 1.0
 
     def relative(self, floor: float | None = None) -> F64:
         """(p,) float64: each probe's mean of |ΔE|² / (E² + (0.05 Ē)²) over its texels; 0 where everything is black.
@@ -141,7 +151,7 @@ class Spread:
 
 
 def spread(sums: NDArray[np.floating], drawn: I64, share: F64, half: int | None = None) -> Spread:
-    """The variance of an estimate from its scrambles, each half's about its own mean.
+    """The variance of an estimate from its scrambles, each half's about its own mean, and from how much the halves differ.
 
     Parameters
     ----------
@@ -152,27 +162,54 @@ def spread(sums: NDArray[np.floating], drawn: I64, share: F64, half: int | None 
     share : (p, SCRAMBLES) float64
         Each scramble's share of the estimate.
     half : int, optional
-        Only that half's word, as if it were the whole estimate.
+        Only that half's word, as if it were the whole estimate; its scrambles' spread, which says too much rather than too little.
     """
     chosen = range(HALVES) if half is None else range(half, half + 1)
     p, _, m, _ = sums.shape
-    square, variance = np.empty((p, m)), np.empty((p, m))
+    square, variance, difference = np.empty((p, m)), np.empty((p, m)), np.zeros((p, m))
     # A few probes at a time: the sums of all of them are most of a bake's memory.
     for first in range(0, p, _PROBES_AT_ONCE):
         part = slice(first, first + _PROBES_AT_ONCE)
         n = len(sums[part])
-        estimate, varied, whole = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, 1, 1))
+        varied, parts, wholes = np.zeros((n, m)), [], []
         for h in chosen:
             own = slice(h * SCRAMBLES_PER_HALF, (h + 1) * SCRAMBLES_PER_HALF)
             weight = share[part, own, None, None]
             means = sums[part, own] / drawn[part, own, None, None].astype(np.float64)
             total, mean = weight.sum(1), (weight * means).sum(1)
-            estimate += mean
-            whole += total
+            parts.append(mean)
+            wholes.append(total)
             varied += ((means - (mean / total)[:, None]) ** 2 * weight**2).sum((1, 3))
-        square[part] = ((estimate / whole) ** 2).sum(-1)
+        whole = np.asarray(sum(wholes))
+        square[part] = ((np.asarray(sum(parts)) / whole) ** 2).sum(-1)
         variance[part] = varied / whole[..., 0] ** 2 * SCRAMBLES_PER_HALF / (SCRAMBLES_PER_HALF - 1)
-    return Spread(square, variance, len(chosen) * (SCRAMBLES_PER_HALF - 1))
+        if half is None:
+            # Of a sum of two that err independently and count alike, half the difference varies as half the sum does.
+            (a, b), (of_a, of_b) = parts, wholes
+            difference[part] = ((a / of_a - b / of_b) ** 2 * (of_a * of_b / whole**2)).sum(-1)
+    found = Spread(square, variance, len(chosen) * (SCRAMBLES_PER_HALF - 1))
+    if half is not None:
+        return found
+    ratio, doubt = _ratio(found.relative(), replace(found, variance=difference).relative())
+    return replace(found, variance=ratio * variance, ratio=ratio, doubt=doubt)
+
+
+def _ratio(scrambles: F64, halves: F64) -> tuple[float, float]:
+    """How much less halves vary than their scrambles say, a standard error on the safe side; and by what factor it may be more.
+
+    Parameters
+    ----------
+    scrambles, halves : (p,) float64
+        What each says of a probe's relative variance.
+    """
+    whole = float(scrambles.sum())
+    if whole <= 0 or whole**2 < _FEWEST_PROBES * float((scrambles**2).sum()):
+        return 1.0, 1.0
+    ratio = float(halves.sum()) / whole
+    error = math.sqrt(float(((halves - ratio * scrambles) ** 2).sum())) / whole
+    # Points that share out a sequence never make a worse estimate than independent ones.
+    likely = min(ratio + error, 1.0)
+    return likely, min(ratio + _Z95 * error, 1.0) / likely if likely > 0 else 1.0
 
 
 def relative_error(found: Spread) -> float:
@@ -183,7 +220,7 @@ def relative_error(found: Spread) -> float:
     float
         0.02 is 2 %. 0 where there is nothing, or everything is black.
     """
-    return error_bound(found.relative(), found.degrees)
+    return error_bound(found.relative(), found.degrees) * math.sqrt(found.doubt)
 
 
 def error_bound(per_probe: F64, degrees: int, times: float = 1.0) -> float:
@@ -209,7 +246,7 @@ def error_bound(per_probe: F64, degrees: int, times: float = 1.0) -> float:
     return math.sqrt(mean * float(f95(n, n * degrees)))
 
 
-def interval(means: F64, share: F64) -> tuple[F64, F64]:
+def interval(means: F64, share: F64, ratio: float) -> tuple[F64, F64]:
     """Two-sided 95 % confidence intervals of numbers that each scramble has estimated.
 
     Student's t, with the degrees of freedom that Welch 1947 and Satterthwaite 1946 give to a sum of two halves' variances.
@@ -220,6 +257,8 @@ def interval(means: F64, share: F64) -> tuple[F64, F64]:
         One half's scrambles stand together.
     share : (p, SCRAMBLES) float64
         Each scramble's share of the estimate.
+    ratio : float
+        :class:`Spread`'s.
 
     Returns
     -------
@@ -238,7 +277,7 @@ def interval(means: F64, share: F64) -> tuple[F64, F64]:
     squares = np.asarray(sum(v**2 for v in variances)) / (SCRAMBLES_PER_HALF - 1)
     degrees = np.divide(total**2, squares, out=np.full_like(total, SCRAMBLES - HALVES), where=squares > 0)
     # Student's t squared is F with one degree of freedom above.
-    return middle, np.sqrt(f95(1.0, degrees) * total)
+    return middle, np.sqrt(f95(1.0, degrees) * ratio * total)
 
 
 def f95(m: float, n: Any) -> Any:

@@ -149,6 +149,13 @@ def _first_chance(nodes, i, p):  # type: ignore[no-untyped-def]
     return a / (a + b) if a + b > 0 else -1.0
 
 
+@kernel
+def _by_power(emitters, w):  # type: ignore[no-untyped-def]
+    i, chance = choose(emitters.cdf, w)
+    rest = (w - (emitters.cdf[i] - chance)) / chance if chance > 0 else 0.0
+    return i, 1 / emitters.total, min(max(rest, 0.0), _BELOW_ONE)
+
+
 def _pick(t, p, w):  # type: ignore[no-untyped-def]
     nodes = t.tree.nodes
     leaf = nodes.shape[0] // 2
@@ -157,7 +164,7 @@ def _pick(t, p, w):  # type: ignore[no-untyped-def]
         i = 2 * i + 1
         first = _first_chance(nodes, i, p)
         if first < 0:
-            return 0, 0.0
+            return 0, 0.0, 0.0
         if w < first:
             w = w / first
             chance *= first
@@ -167,7 +174,7 @@ def _pick(t, p, w):  # type: ignore[no-untyped-def]
             i += 1
         # Rounding must not make it 1, which no chance is above.
         w = min(w, _BELOW_ONE)
-    return i - leaf, chance / nodes[i, 9]
+    return i - leaf, chance / nodes[i, 9], w
 
 
 def _share(t, item, triangle, p):  # type: ignore[no-untyped-def]
@@ -189,6 +196,6 @@ def _share(t, item, triangle, p):  # type: ignore[no-untyped-def]
 
 
 # An emitter for a point (t, point, number in [0, 1)): which, and its chance over its power; a chance of 0 where none lights the point.
-pick_emitter = either("tree")(_pick)(lambda t, p, w: (choose(t.emitters.cdf, w)[0], 1 / t.emitters.total))
+pick_emitter = either("tree")(_pick)(lambda t, p, w: _by_power(t.emitters, w))
 # The same of an emitter that a ray from the point has met (t, item, triangle, point).
 emitter_share = either("tree")(_share)(lambda t, item, triangle, p: 1 / t.emitters.total)

@@ -40,10 +40,10 @@ def emitter_strength(t, material, triangle):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
-    """A point on the emissive triangles, as seen from a point: the triangle by :func:`bake_core.light_tree.pick_emitter`, there by area.
+def sample_emitter(t, px, py, pz, i, share, u, v):  # type: ignore[no-untyped-def]
+    """A point on emissive triangle i, drawn by area, as seen from a point.
 
-    Pdf: :func:`pdf_emitter`.
+    `share` is what :func:`bake_core.light_tree.pick_emitter` tells of it. Pdf: :func:`pdf_emitter`.
 
     Returns
     -------
@@ -53,7 +53,6 @@ def sample_emitter(t, px, py, pz, u, v, w):  # type: ignore[no-untyped-def]
     """
     e = t.emitters
     radiance = (0.0, 0.0, 0.0)
-    i, share = pick_emitter(t, (px, py, pz), np.float64(w))
     b1, b2 = uniform_triangle(u, v)
     b0 = 1.0 - b1 - b2
     x = b0 * e.vertices[i, 0, 0] + b1 * e.vertices[i, 1, 0] + b2 * e.vertices[i, 2, 0]
@@ -85,7 +84,8 @@ def from_emitters(t, ray, ray_bits, p, n, epsilon, glossy, look, u, v, w):  # ty
 
     The balance heuristic's weight p_l / (p_l + p_b) is already in it.
     """
-    radiance, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], u, v, w)
+    i, share, _ = pick_emitter(t, (p[0], p[1], p[2]), np.float64(w))
+    radiance, d, pdf, end = sample_emitter(t, p[0], p[1], p[2], i, share, u, v)
     if pdf <= 0:
         return 0.0, 0.0, 0.0
     fr, fg, fb, bsdf_pdf = scattered(t, glossy, look, d[0], d[1], d[2], n)

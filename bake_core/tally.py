@@ -177,11 +177,11 @@ class State(Stored):
 
         For as many samples as there are scrambles, or more.
         """
-        return interval(self.scramble_means().mean((2, 3)), self._share())
+        return interval(self.scramble_means().mean((2, 3)), self._share(), self._ratio())
 
     def texel_interval(self) -> tuple[F64, F64]:
         """(n, m, 3) float64 twice: as :meth:`mean_interval`, of each texel and colour."""
-        return interval(self.scramble_means(), self._share())
+        return interval(self.scramble_means(), self._share(), self._ratio())
 
     def error(self) -> float | None:
         """DESIGN's error figure; None while it cannot be measured."""
@@ -224,6 +224,10 @@ class State(Stored):
         variance, taken = found.relative(), self.taken[self.active()].sum(1)
         whole = float(variance.sum())
         return float((variance * taken).sum()) / whole if whole > 0 else self.mean_samples()
+
+    def _ratio(self) -> float:
+        found = self.spread()
+        return 1.0 if found is None else found.ratio
 
     def _per_sample(self) -> F64:
         """(n, HALVES) float64: what a sample weighs. Halves count alike whatever their numbers of samples: no value has a say in that."""

@@ -24,7 +24,7 @@ Array = NDArray[Any]
 @entry_kernel
 def _pick(t, p, w, emitter, share):  # type: ignore[no-untyped-def]
     for i in range(w.shape[0]):
-        emitter[i], share[i] = pick_emitter(t, (p[0], p[1], p[2]), w[i])
+        emitter[i], share[i], _ = pick_emitter(t, (p[0], p[1], p[2]), w[i])
 
 
 @entry_kernel
