@@ -32,7 +32,7 @@ _Z95 = 1.6448536269514722
 SMALLEST_PASS = SCRAMBLES
 _PROBES_AT_ONCE = 512
 # Where fewer probes than these have most of the variance, nobody knows how much less than their scrambles their halves vary.
-_FEWEST_PROBES = 16
+_FEWEST_PROBES = 4
 
 Verdict = Literal["continue", "target", "samples", "time", "interrupt"]
 
@@ -195,21 +195,24 @@ def spread(sums: NDArray[np.floating], drawn: I64, share: F64, half: int | None 
 
 
 def _ratio(scrambles: F64, halves: F64) -> tuple[float, float]:
-    """How much less halves vary than their scrambles say, a standard error on the safe side; and by what factor it may be more.
+    """How much less halves vary than their scrambles say, and by what factor it may be more.
 
     Parameters
     ----------
     scrambles, halves : (p,) float64
         What each says of a probe's relative variance.
     """
-    whole = float(scrambles.sum())
-    if whole <= 0 or whole**2 < _FEWEST_PROBES * float((scrambles**2).sum()):
+    whole, square = float(scrambles.sum()), float((scrambles**2).sum())
+    # How many probes make the variance, had all as much of it (Kish 1965, "Survey Sampling", section 8.2).
+    if square <= 0 or whole**2 / square < _FEWEST_PROBES:
         return 1.0, 1.0
     ratio = float(halves.sum()) / whole
     error = math.sqrt(float(((halves - ratio * scrambles) ** 2).sum())) / whole
     # Points that share out a sequence never make a worse estimate than independent ones.
-    likely = min(ratio + error, 1.0)
-    return likely, min(ratio + _Z95 * error, 1.0) / likely if likely > 0 else 1.0
+    likely = min(ratio, 1.0)
+    # On both sides of Student's distribution, for a ratio of few probes is not as well known as its scatter says.
+    student = math.sqrt(float(f95(1.0, whole**2 / square - 1)))
+    return likely, min(ratio + student * error, 1.0) / likely if likely > 0 else 1.0
 
 
 def relative_error(found: Spread) -> float:
