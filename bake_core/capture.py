@@ -123,6 +123,7 @@ def _sample_lights(t, ray, ray_bits, position, texel, texels, rounds, rate, key,
         u, v = sobol_pair(reversed_index, key)
         if t.emitters.cdf.shape[0]:
             # The number that picks the emitter goes on to place the point on it: all emitters together are stratified as one square.
+            # Where its bits are too few for both, the emitter is one of very many, or so faint that capture rays have its share.
             emitter, chance, rest = pick_emitter(t, position, np.float64(u))
             le, d, pdf, end = sample_emitter(t, position[0], position[1], position[2], emitter, chance, np.float32(rest), v)
             x, y, z = end[0] - position[0], end[1] - position[1], end[2] - position[2]

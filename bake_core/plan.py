@@ -107,8 +107,8 @@ class Pilot:
     active : (p,) bool
     variance : (a,) float64
         Of those that are active: relative, as the error figure has it, after the pilot's samples.
-    degrees : int
-        Of freedom, of each.
+    degrees, doubt : int, float
+        Of freedom, of each; and by how much more all may be (:class:`bake_core.convergence.Spread`).
     fall : float
         The power of 1/n with which variances fell from the pilot's first half to its end, within what is possible.
     allocation : Allocation
@@ -124,10 +124,15 @@ class Pilot:
     active: NDArray[np.bool_]
     variance: F64
     degrees: int
+    doubt: float
     fall: float
     allocation: Allocation
     times: float
     learning_seconds: float
+
+    def error(self, variance: F64) -> float:
+        """The bound that the bake would state, whose many probes leave less doubt."""
+        return error_bound(variance, self.degrees, self.times) * math.sqrt(1 + (self.doubt - 1) / math.sqrt(self.times))
 
     def cost(self, taken: F64) -> F64:
         """(p,) float64: seconds for each probe, where active ones take so many samples, (a,)."""
@@ -164,7 +169,7 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     return Plan(
         **vars(contents(prepared)),
         paths_per_second=float(pilot.active.mean()) * prepared.selection.capture**2 / per_sample if per_sample else 0.0,
-        pilot_error=error_bound(pilot.variance, pilot.degrees, pilot.times),
+        pilot_error=pilot.error(pilot.variance),
         samples=samples,
         seconds=seconds(taken),
         least_seconds=seconds(least) / pace,
@@ -210,7 +215,7 @@ def samples_needed(stop: Stop, pilot: Pilot) -> tuple[int, F64]:
         if samples > PILOT_SAMPLES:
             taken = given.spans((0, samples))[..., 1].sum(1).astype(np.float64)
         if samples >= SCRAMBLES:
-            error = error_bound(pilot.variance * (PILOT_SAMPLES / taken) ** pilot.fall, pilot.degrees, pilot.times)
+            error = pilot.error(pilot.variance * (PILOT_SAMPLES / taken) ** pilot.fall)
         if decide(stop, samples, error, 0.0) != "continue":
             return samples, taken
 
@@ -237,7 +242,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
     count = min(_PILOT_PROBES, len(wanted))
     if not count:
         nothing = np.zeros(0)
-        return Pilot(nothing, 0.0, np.zeros(0, np.bool_), nothing, 1, 1.0, Allocation.start(0), 1.0, 0.0)
+        return Pilot(nothing, 0.0, np.zeros(0, np.bool_), nothing, 1, 1.0, 1.0, Allocation.start(0), 1.0, 0.0)
     # Every so-many-th would be a diagonal through the grid.
     within = np.random.default_rng(prepared.spec.seed).random(count)
     chosen = wanted[((np.arange(count) + within) * len(wanted) / count).astype(int)]
@@ -268,6 +273,7 @@ def trace_pilot(prepared: Prepared, threads: int) -> Pilot:
         active=active,
         variance=after,
         degrees=late.degrees,
+        doubt=late.doubt,
         fall=min(max(fell, 1.0), _STEEPEST),
         allocation=Allocation(state.taken[active], state.eighths[active]),
         times=len(wanted) / count,

@@ -70,7 +70,8 @@ def test_a_screen_lets_a_quarter_through_to_the_eye(tmp_path: Path, kind: str) -
     square(w, "lamp", CEILING * 400 + [0, 2, 0], w.material("lamp", (0, 0, 0), emission=(1, 1, 1)))
     material, more = screen(w, kind)
     square(w, "screen", FLOOR * 300 + [0, 1, 0], material, 4000, **more)
-    texels = bake(tmp_path, w, probe([0.1, 0.7, 0.1]))
+    # At 256 samples, whether rays pass is left to chance by 1.2 % of irradiance.
+    texels = bake(tmp_path, w, probe([0.1, 0.7, 0.1], stop={"target_error": None, "max_samples": 4096}))
     up = texel_directions(8).reshape(-1, 3)[:, 1]
     best = int(np.argmax(up))
     # A tilted texel sees (1 + cosθ)/2 of the plane.

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF, uniform
-from bake_core.capture import Capture, capture_distance, capture_radiance
+from bake_core.capture import Capture, _capture_texel, capture_distance, capture_radiance
 from bake_core.errors import Cancelled
 from bake_core.examples import closed_box, plane_under_sun, square_emitter, two_rooms
-from bake_core.octahedral import texel_directions
+from bake_core.octahedral import dir_to_oct, texel_directions
 from bake_core.scene import Scene
 from bake_core.tracer import Tracer
 from tests.scenes import build, load_example, sky, square_scene
@@ -181,6 +181,27 @@ def test_radiance_is_the_mean_over_each_texel() -> None:
     assert radiance.mean() == pytest.approx(covered.mean(), rel=2e-3)
     assert radiance.min() == 0 and radiance.max() == 1
     assert ((radiance > 0) & (radiance < 1)).any()
+
+
+def test_the_edge_of_a_small_lamp_is_sampled_as_a_light() -> None:
+    """From beside both squares, whose edges lie in every texel that sees them: capture rays alone err three times as much."""
+    tracer = build(load_example(square_emitter()[0]))
+    radiance = gather(tracer, np.tile([0.0, 0.0, 1.5], (20, 1)), (0, 64), keep_radiance=True)[1][..., 0] / 64
+    directions, _ = quadrature(16, 64)
+    x, y, z = np.moveaxis(directions, -1, 0)
+    covered = ((abs(y / x) < 0.5) & (abs(1.5 + z / abs(x)) < 0.5)).mean(-1).reshape(-1)
+    edge = (covered > 0) & (covered < 1)
+    assert math.sqrt(((radiance - covered)[:, edge] ** 2).mean()) < 0.008
+    np.testing.assert_allclose(radiance.mean(0), covered, atol=0.006)
+    assert not radiance[:, covered == 0].any()
+
+
+@pytest.mark.parametrize("resolution", [1, 8, 16, 31])
+def test_light_falls_into_the_texel_that_its_direction_leads_through(resolution: int) -> None:
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    column, row = np.minimum(((dir_to_oct(directions) + 1) / 2 * resolution).astype(int), resolution - 1).T
+    assert [_capture_texel(d, resolution**2) for d in directions] == (row * resolution + column).tolist()
 
 
 def test_cancelling_stops_at_once_and_raises() -> None:

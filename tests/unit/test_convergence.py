@@ -155,6 +155,33 @@ def test_the_bound_holds_where_a_few_probes_make_all_the_error() -> None:
     assert held > 0.92
 
 
+def joined(random: np.random.Generator, probes: int, kept: float) -> tuple[Array, Array]:
+    """As `synthetic`, but a half's scrambles err against one another: of their mean's variance only so much is left."""
+    truth = 0.2 + random.random((probes, 1, 16, 3))
+    error = random.normal(size=(probes, HALVES, SCRAMBLES_PER_HALF, 1, 1))
+    mean = error.mean(2, keepdims=True)
+    error = error + (math.sqrt(kept) - 1) * mean
+    means = truth * (1 + 0.1 * error.reshape(probes, SCRAMBLES, 1, 1))
+    return means * rounds(64)[:, None, None], truth[:, 0]
+
+
+@pytest.mark.parametrize(("probes", "loosest"), [(1, 6.0), (30, 2.0), (300, 1.25)])
+def test_the_halves_say_how_much_less_they_err_than_their_scrambles(probes: int, loosest: float) -> None:
+    random = np.random.default_rng(3)
+    held, ratio, known = [], [], []
+    for _ in range(500):
+        sums, truth = joined(random, probes, 0.4)
+        drawn = np.broadcast_to(rounds(64), sums.shape[:2])
+        bound, error = error_of(sums, 64), true_error(sums, 64, truth)
+        held.append(error <= bound)
+        ratio.append(bound / error)
+        known.append(spread(sums, drawn, drawn / 64).ratio)
+    assert np.mean(held) > 0.95 - 3 * math.sqrt(0.05 * 0.95 / 500)
+    assert np.median(ratio) < loosest
+    # Of one probe nobody knows; the spread about a half's mean is that of scrambles that err independently.
+    assert np.mean(known) == (1 if probes == 1 else pytest.approx(0.4, rel=0.1))
+
+
 def test_f_distribution() -> None:
     """Against the printed table."""
     for m, n, quantile in ((1, 3, 10.128), (2, 6, 5.143), (4, 12, 3.259), (8, 24, 2.355), (30, 90, 1.586)):

@@ -69,9 +69,9 @@ def test_beyond_the_grid_nothing_is_known() -> None:
 # --- light -------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bounces", [None, 4])
+@pytest.mark.parametrize("bounces", [None, 2, 4, 9])
 def test_a_closed_box_has_the_closed_form_s_light(bounces: int | None) -> None:
-    """π Le (1 - aᵏ⁺¹) / (1 - a), the cache limited to as many bounces as paths are."""
+    """π Le (1 - aᵏ⁺¹) / (1 - a), the cache limited to as many bounces as paths are: with one layer, some, and more than have their own."""
     albedo, emission = 0.6, 2.0
     p = prepared(closed_box(albedo, emission, bounces), integrator="cache", volumes=[_INSIDE])
     assert p.light is not None

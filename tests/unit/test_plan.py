@@ -161,7 +161,7 @@ def pilot(error: float, *, fall: float = 1.0, probes: int = 8, **changes: Any) -
     variance *= (error / error_bound(variance, 14, 4.0)) ** 2
     taken = np.full((probes, HALVES), PILOT_SAMPLES // HALVES)
     everybody = np.ones(probes, np.bool_)
-    made = Pilot(np.ones(probes), 0.5, everybody, variance, 14, fall, Allocation(taken, np.full((probes, HALVES), FULL)), 4.0, 0.0)
+    made = Pilot(np.ones(probes), 0.5, everybody, variance, 14, 1.0, fall, Allocation(taken, np.full((probes, HALVES), FULL)), 4.0, 0.0)
     return replace(made, **changes)
 
 
