@@ -14,7 +14,7 @@ both, whose weights are constants too. No weight depends on a value that it mult
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,11 @@ _PART_OF_TARGET = 0.8
 def of_half(samples: int, half: int) -> int:
     """How many of a bake's first `samples` samples are a half's."""
     return (samples + HALVES - 1 - half) // HALVES
+
+
+def of_scramble(samples: Any, scramble: Any) -> Any:
+    """How many of a half's first `samples` samples are a scramble's, 0 to SCRAMBLES_PER_HALF - 1: ints or arrays; in kernels, too."""
+    return (samples + SCRAMBLES_PER_HALF - 1 - scramble) // SCRAMBLES_PER_HALF
 
 
 def uniform(probes: int, samples: tuple[int, int]) -> I64:

@@ -223,20 +223,20 @@ def relative_error(found: Spread) -> float:
     float
         0.02 is 2 %. 0 where there is nothing, or everything is black.
     """
-    return error_bound(found.relative(), found.degrees) * math.sqrt(found.doubt)
+    return error_bound(found.relative(), found.degrees, found.doubt)
 
 
-def error_bound(per_probe: F64, degrees: int, times: float = 1.0) -> float:
+def error_bound(per_probe: F64, degrees: int, doubt: float, times: float = 1.0) -> float:
     """The 95 % bound of a root mean square from each probe's estimated mean square.
 
     Parameters
     ----------
     per_probe : (p,) float64
         As :meth:`Spread.relative` has it.
-    degrees : int
-        Of freedom, of each.
+    degrees, doubt : int, float
+        Of freedom, of each; and by how much more all may be: :class:`Spread`'s.
     times : float
-        Of how many times as many probes like these: what a plan says of a bake from a few of its probes.
+        Of how many times as many probes like these, which leave less doubt: what a plan says of a bake from a few of its probes.
     """
     mean = float(per_probe.mean()) if per_probe.size else 0.0
     if mean == 0:
@@ -246,7 +246,7 @@ def error_bound(per_probe: F64, degrees: int, times: float = 1.0) -> float:
     n = min(float(per_probe.sum()) ** 2 / float((per_probe**2).sum()) * (1 + 2 / degrees), len(per_probe)) * times
     # The error itself scatters like χ² of n degrees of freedom, what is known of it like n times those of each: their quotient is
     # F-distributed.
-    return math.sqrt(mean * float(f95(n, n * degrees)))
+    return math.sqrt(mean * float(f95(n, n * degrees)) * (1 + (doubt - 1) / math.sqrt(times)))
 
 
 def interval(means: F64, share: F64, ratio: float) -> tuple[F64, F64]:

@@ -130,10 +130,6 @@ class Pilot:
     times: float
     learning_seconds: float
 
-    def error(self, variance: F64) -> float:
-        """The bound that the bake would state, whose many probes leave less doubt."""
-        return error_bound(variance, self.degrees, self.times) * math.sqrt(1 + (self.doubt - 1) / math.sqrt(self.times))
-
     def cost(self, taken: F64) -> F64:
         """(p,) float64: seconds for each probe, where active ones take so many samples, (a,)."""
         out = np.full(len(self.seconds), self.distance_seconds)
@@ -169,7 +165,7 @@ def plan(scene: Scene, spec: Spec, *, threads: int, find: Find = no_images) -> P
     return Plan(
         **vars(contents(prepared)),
         paths_per_second=float(pilot.active.mean()) * prepared.selection.capture**2 / per_sample if per_sample else 0.0,
-        pilot_error=pilot.error(pilot.variance),
+        pilot_error=error_bound(pilot.variance, pilot.degrees, pilot.doubt, pilot.times),
         samples=samples,
         seconds=seconds(taken),
         least_seconds=seconds(least) / pace,
@@ -215,7 +211,8 @@ def samples_needed(stop: Stop, pilot: Pilot) -> tuple[int, F64]:
         if samples > PILOT_SAMPLES:
             taken = given.spans((0, samples))[..., 1].sum(1).astype(np.float64)
         if samples >= SCRAMBLES:
-            error = pilot.error(pilot.variance * (PILOT_SAMPLES / taken) ** pilot.fall)
+            then = pilot.variance * (PILOT_SAMPLES / taken) ** pilot.fall
+            error = error_bound(then, pilot.degrees, pilot.doubt, pilot.times)
         if decide(stop, samples, error, 0.0) != "continue":
             return samples, taken
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.capture import capture_distance
+from bake_core.distances import capture_distance
 from bake_core.kernels import entry_kernel, kernel
 from bake_core.reach import items_meeting
 from bake_core.scene import ALPHA_OPAQUE, Scene

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bake_core.allocation import Allocation
-from bake_core.capture import Capture, capture_distance, capture_radiance
+from bake_core.capture import Capture, capture_radiance
+from bake_core.distances import capture_distance
 from bake_core.octahedral import texel_solid_angles
 from bake_core.prepared import Prepared
 from bake_core.tally import Tally, outside

@@ -43,6 +43,8 @@ _COVERED = 0.5
 # A point twice, while cells are made of it; a cell with its place in the table, in all sizes together.
 _POINT_BYTES, _LIGHT_BYTES, _CELL_BYTES = 2 * 90, 2 * 24, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
 _SEED = 0x11C4C3E5
+# What makes a point's paths of each layer other ones.
+_LAYER_KEYS = np.random.default_rng(_SEED).integers(1 << 64, size=_MOST_LAYERS, dtype=np.uint64)
 
 
 @dataclass(eq=False)
@@ -158,12 +160,12 @@ class SurfaceLight:
         self._rays: list[int] = []
 
     @property
-    def _bounces(self) -> list[np.int64]:
+    def _bounces(self) -> list[int]:
         """Of the light that each layer knows, the lowest first."""
-        most = self.tracer.tables.max_bounces
+        most = int(self.tracer.tables.max_bounces)
         if not self._limited:
             return [most, most]
-        return [np.int64(bounces) for bounces in range(max(int(most) - _MOST_LAYERS, 1), int(most))]
+        return list(range(max(most - _MOST_LAYERS, 1), most))
 
     def _learn(self, stage: int, threads: int, cancelled: Flag) -> None:
         bounces, grid = self._bounces, self._grid(stage)
@@ -172,17 +174,16 @@ class SurfaceLight:
         old, points, rays = len(self._points), self._points + found.points, found.rays
         # Without limits the last stage knows of the same light, and better than a lower layer would.
         lowest = 1 if stage and not self._limited else 0
-        light, known = [*self._light], self._cached if lowest else _bounded(self.blank(), bounces[0])
+        light, known = [*self._light], self._cached if lowest else self.blank()
         for layer in range(lowest, len(bounces)):
-            teacher = _teaching(known)
+            teacher = _teaching(known, bounces[layer])
             light[layer] = np.concatenate([self._light[layer], np.zeros((len(points) - old, 3))])
-            # Paths of its own.
-            of_layer = replace(points, key=points.key ^ np.uint64(len(bounces) - 1 - layer), light=light[layer])
+            of_layer = replace(points, key=points.key ^ _LAYER_KEYS[layer], light=light[layer])
             paths = self.paths(stage, layer)
             for part, first in ((slice(old), self.paths(stage - 1, layer) if stage else 0), (slice(old, None), 0)):
                 rays += gather_light(teacher, of_layer[part], (first, paths), threads=threads, cancelled=cancelled)
             cache, traced = average(self.tracer, of_layer, paths, grid, threads=threads)
-            known, rays = _bounded(_with(self.tracer, cache), bounces[layer] + self._limited), rays + traced
+            known, rays = _with(self.tracer, cache), rays + traced
         self._learnt, self._points, self._light, self._cached = stage, points, light, known
         self._rays.append(rays)
 
@@ -224,15 +225,15 @@ def surface_light(spec: Spec, tracer: Tracer, positions: F64, units: F64, texels
     return light if light.cached >= _COVERED or spec.integrator == "cache" else None
 
 
-def _teaching(tracer: Tracer) -> Tracer:
-    """With a cache that does not answer beside where it is asked from: what it smooths there would be seen at large, and smoothed again."""
+def _teaching(tracer: Tracer, bounces: int) -> Tracer:
+    """For paths of so many bounces, with a cache that does not answer beside where it is asked from.
+
+    What it smooths there would be seen at large, and smoothed again.
+    """
     cache = tracer.tables.cache
     assert cache is not None
-    return _with(tracer, cache._replace(grid=np.array([*cache.grid[:7], _FAR])))
-
-
-def _bounded(tracer: Tracer, bounces: np.int64) -> Tracer:
-    return replace(tracer, tables=tracer.tables._replace(max_bounces=np.int64(bounces)))
+    far = cache._replace(grid=np.array([*cache.grid[:7], _FAR]))
+    return replace(tracer, tables=tracer.tables._replace(cache=far, max_bounces=np.int64(bounces)))
 
 
 def _with(tracer: Tracer, cache: LightCache) -> Tracer:

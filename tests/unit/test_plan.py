@@ -158,7 +158,7 @@ def test_nothing_left_out_changes_what_is_kept(kind: str) -> None:
 def pilot(error: float, *, fall: float = 1.0, probes: int = 8, **changes: Any) -> Pilot:
     """One after which the bake's error figure would be `error`; every probe errs alike, and gets as many samples."""
     variance = np.ones(probes)
-    variance *= (error / error_bound(variance, 14, 4.0)) ** 2
+    variance *= (error / error_bound(variance, 14, 1.0, 4.0)) ** 2
     taken = np.full((probes, HALVES), PILOT_SAMPLES // HALVES)
     everybody = np.ones(probes, np.bool_)
     made = Pilot(np.ones(probes), 0.5, everybody, variance, 14, 1.0, fall, Allocation(taken, np.full((probes, HALVES), FULL)), 4.0, 0.0)

@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from bake_core.capture import capture_distance
+from bake_core.distances import capture_distance
 from bake_core.embree import intersect1, new_rayhit, set_ray
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.octahedral import texel_directions
