@@ -1,7 +1,8 @@
 """How kernels are compiled: one place for the options that numbers and speed depend on.
 
 No fastmath (the same bits on every run, and NaN means something), no bounds checks, and no reference counting: kernels own no array, and
-counting the tables of a scene in and out of every call took three quarters of a path's time in a box of twelve triangles.
+counting the tables of a scene in and out of every call took three quarters of a path's time in a box of twelve triangles. What kernels
+call is always inlined: tables are handed on word by word, some hundreds at every call that is left, which was a quarter of a path's time.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ CANCELLED, DONE = 1, 0
 
 numba.config.CACHE_DIR = str(kernel_cache_dir())
 
-# A kernel that only other kernels call; LLVM inlines it as it sees fit.
-kernel: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(_nrt=False, error_model="numpy")
+_OPTIONS: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
+_INLINED: dict[str, Any] = {**_OPTIONS, "forceinline": True}
+# A kernel that only other kernels call.
+kernel: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(**_INLINED)
 # A kernel that Python calls: without the GIL, and kept on disk.
-entry_kernel: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(_nrt=False, error_model="numpy", nogil=True, cache=True)
+entry_kernel: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(**_OPTIONS, nogil=True, cache=True)
 
 
 def either(field: str) -> Callable[[Callable[..., Any]], Callable[[Callable[..., Any]], Callable[..., Any]]]:
@@ -45,7 +48,7 @@ def either(field: str) -> Callable[[Callable[..., Any]], Callable[[Callable[...,
                 chosen = none if isinstance(kind, types.NoneType) else some
                 return getattr(chosen, "py_func", chosen)
 
-            overload(called, jit_options={"_nrt": False, "error_model": "numpy"}, strict=False)(choose)
+            overload(called, jit_options=_INLINED, strict=False)(choose)
             return called
 
         return second
