@@ -13,7 +13,7 @@ from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF
 from bake_core.cache_points import Points
 from bake_core.embree import new_rayhit, rays_traced
 from bake_core.kernels import entry_kernel, kernel
-from bake_core.light_cache import AXIS_BITS, NONE, LightCache, cell_key, cell_of, find, sees_middle
+from bake_core.light_cache import AXIS_BITS, NONE, LightCache, cell_key, cell_of, find, in_open_plane, sees_middle
 from bake_core.tracer import Tables, Tracer
 
 F64 = NDArray[np.float64]
@@ -24,6 +24,9 @@ FEWEST = 2
 # How far above the surface a cell's middle is, in cell sizes; where that is not free, a quarter of it, and a quarter of that.
 _HEIGHT = 0.25
 _TRIES = 3
+# Who stands in one plane with all of a cell's points need not ask whether its middle is seen, if so many times so many places all over that
+# plane see it, at the cell's sides and corners too: what crosses the cell hides it from one of them.
+_LOOKS = 4
 # Cells a thread averages at once.
 _CHUNK = 1024
 
@@ -56,9 +59,33 @@ def _place_middle(t, ray, ray_bits, height, s, middle):  # type: ignore[no-untyp
         if sees_middle(t, ray, ray_bits, p, n, epsilon, middle):
             for axis in range(3):
                 middle[axis] = p[axis] + height * n[axis]
+            middle[3] = height
             return True
         height /= 4
     return False
+
+
+@kernel
+def _is_open(t, ray, ray_bits, grid, level, s, middle):  # type: ignore[no-untyped-def]
+    """Whether a cell's middle is seen from all over the plane of one of its points, to the cell's sides and corners."""
+    size = grid[3] * 2.0**level
+    a = 0
+    for axis in range(1, 3):
+        if abs(s[3 + axis]) > abs(s[3 + a]):
+            a = axis
+    b, c = (a + 1) % 3, (a + 2) % 3
+    i, j, k, _ = cell_of(grid, (s[0], s[1], s[2]))
+    cell = (i >> level, j >> level, k >> level)
+    for row in range(_LOOKS):
+        for column in range(_LOOKS):
+            over_b = grid[b] + (cell[b] + row / (_LOOKS - 1)) * size - s[b]
+            over_c = grid[c] + (cell[c] + column / (_LOOKS - 1)) * size - s[c]
+            over = (-(s[3 + b] * over_b + s[3 + c] * over_c) / s[3 + a], over_b, over_c)
+            # Axis a's is the first of `over`, the next one's the second.
+            p = (s[0] + over[(0 - a) % 3], s[1] + over[(1 - a) % 3], s[2] + over[(2 - a) % 3])
+            if not sees_middle(t, ray, ray_bits, p, (s[3], s[4], s[5]), s[9], middle):
+                return False
+    return True
 
 
 @entry_kernel
@@ -85,13 +112,18 @@ def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, 
             continue
         sums[:] = 0.0
         fewest = math.inf
+        open_plane = True
         for i in range(begin[c], end[c]):
             s = place[i]
-            if sees_middle(t, ray, ray_bits, (s[0], s[1], s[2]), (s[3], s[4], s[5]), s[9], middle[c]):
+            p, n = (s[0], s[1], s[2]), (s[3], s[4], s[5])
+            open_plane = open_plane and in_open_plane(p, n, middle[c])
+            if sees_middle(t, ray, ray_bits, p, n, s[9], middle[c]):
                 for channel in range(3):
                     sums[scramble[i], channel] += light[i, channel]
                 sums[scramble[i], 3] += 1
                 answered[i] = True
+            else:
+                open_plane = False
         for half in range(HALVES):
             own = half * SCRAMBLES_PER_HALF
             red = green = blue = count = 0.0
@@ -114,6 +146,8 @@ def _cells_kernel(t, ray, grid, level, begin, end, place, way, scramble, light, 
         known[c] = fewest >= FEWEST
         if not known[c]:
             answered[begin[c] : end[c]] = False
+        elif not (open_plane and _is_open(t, ray, ray_bits, grid, level, place[begin[c]], middle[c])):
+            middle[c, 3] = 0.0
 
 
 @entry_kernel
@@ -165,7 +199,7 @@ def _level(
     edges = np.flatnonzero(np.diff(code >> np.uint64(3 * level), prepend=NONE, append=NONE))
     enough = np.flatnonzero(np.diff(edges) >= HALVES * FEWEST)
     begin, end, n = edges[enough], edges[enough + 1], len(enough)
-    key, known, middle = np.empty(n, np.uint64), np.empty(n, np.bool_), np.empty((n, 3))
+    key, known, middle = np.empty(n, np.uint64), np.empty(n, np.bool_), np.empty((n, 4))
     light, answered = np.empty((n, SCRAMBLES, 3), np.float32), np.zeros(len(points), np.bool_)
     radiance = (points.light / paths).astype(np.float32)
 

@@ -17,6 +17,7 @@ from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.allocation import SCRAMBLES
+from bake_core.cache_guide import PARTS, Guide, guided
 from bake_core.embree import new_rayhit, rays_traced
 from bake_core.errors import Cancelled
 from bake_core.kernels import CANCELLED, DONE, entry_kernel
@@ -30,6 +31,7 @@ from bake_core.transport import trace_by_cosine
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 Flag = NDArray[np.uint8]
 
 # Rays a thread takes at once: tens of milliseconds' work.
@@ -116,8 +118,19 @@ def _points_kernel(t, ray, positions, first, first_round, rounds, seed, cancelle
 
 
 @entry_kernel
-def _gather_kernel(t, ray, place, key, scramble, first_path, paths, cancelled, light):  # type: ignore[no-untyped-def]
-    """Some more paths from each point, of which it has had `first_path`."""
+def _gather_kernel(t, ray, place, key, scramble, guide, row, first_path, paths, cancelled, light, part, brought):  # type: ignore[no-untyped-def]
+    """Some more paths from each point, of which it has had `first_path`.
+
+    Parameters
+    ----------
+    guide : (g, PARTS, PARTS + 1) float32
+        :meth:`bake_core.cache_guide.Guide.table`.
+    row : (n,) int64
+        Each point's in the guide; below 0 where it has none.
+    light : (n, 3) float64, added to
+    part, brought : (n, paths) uint8 and (n, paths, 2) float32, or (n, 0) and (n, 0, 2)
+        As :meth:`bake_core.cache_guide.Guide.heard` takes them.
+    """
     ray_bits = ray.view(np.uint32)
     for i in range(place.shape[0]):
         if cancelled[0]:
@@ -127,10 +140,19 @@ def _gather_kernel(t, ray, place, key, scramble, first_path, paths, cancelled, l
         red = green = blue = 0.0
         for path in range(first_path, first_path + paths):
             index = uint32(path)
-            r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, s[9], reverse_bits(index), index, key[i], True, scramble[i])
-            red += r
-            green += g
-            blue += b
+            reversed_index = reverse_bits(index)
+            u, v = sobol_pair(reversed_index, key[i])
+            weight = 1.0
+            if row[i] >= 0:
+                u, v, weight = guided(guide[row[i]], u, v)
+            r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, s[9], u, v, reversed_index, index, key[i], True, scramble[i])
+            red += weight * r
+            green += weight * g
+            blue += weight * b
+            if part.shape[1]:
+                part[i, path - first_path] = int(u * PARTS) * PARTS + int(v * PARTS)
+                brought[i, path - first_path, 0] = weight * (r + g + b) ** 2
+                brought[i, path - first_path, 1] = weight
         light[i, 0] += red
         light[i, 1] += green
         light[i, 2] += blue
@@ -180,20 +202,30 @@ def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: i
     return Found(points, int((way != _MISSED).sum()), rays)
 
 
-def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, threads: int, cancelled: Flag) -> int:
+def gather_light(
+    tracer: Tracer, points: Points, guide: Guide, rows: I64, paths: tuple[int, int], *, keep: bool, threads: int, cancelled: Flag
+) -> tuple[int, Guide]:
     """Add what paths bring to every point's light; the same bits for any number of threads.
 
     Parameters
     ----------
     tracer : Tracer
         With the cache that paths may end in.
+    guide : Guide
+        Where paths go.
+    rows : (n,) int64
+        Each point's in it.
     paths : (int, int)
         Half-open range of paths from each point.
+    keep : bool
+        Whether the guide shall know of them.
 
     Returns
     -------
     int
         Rays that it took.
+    Guide
+        The one that there was, or what it knows now.
 
     Raises
     ------
@@ -201,13 +233,16 @@ def gather_light(tracer: Tracer, points: Points, paths: tuple[int, int], *, thre
     """
     count = paths[1] - paths[0]
     step = max(_CHUNK_PATHS // max(count, 1), 1)
+    table, kept = guide.table(), (len(points), count if keep else 0)
+    part, brought = np.zeros(kept, np.uint8), np.zeros((*kept, 2), np.float32)
 
     def some(ray: F32, first: int) -> int:
-        part = slice(first, first + step)
-        asked = (points.place[part], points.key[part], points.scramble[part], paths[0], count)
-        return int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[part]))
+        at = slice(first, first + step)
+        asked = (points.place[at], points.key[at], points.scramble[at], table, rows[at], paths[0], count)
+        return int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[at], part[at], brought[at]))
 
-    return _on_threads(some, range(0, max(len(points), 1), step), threads)
+    rays = _on_threads(some, range(0, max(len(points), 1), step), threads)
+    return rays, guide.heard(rows, part, brought) if keep else guide
 
 
 def _on_threads(some: Callable[[F32, int], int], firsts: range, threads: int) -> int:

@@ -7,21 +7,23 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.allocation import HALVES, SCRAMBLES, SCRAMBLES_PER_HALF, of_scramble
-from bake_core.embree import new_rayhit, rays_traced
+from bake_core.embree import LANES, Packet, new_packet, new_rayhit, rays_traced, set_lane, take_lane
 from bake_core.environment import has_sky
 from bake_core.errors import Cancelled
 from bake_core.kernels import CANCELLED, DONE, entry_kernel, kernel
 from bake_core.octahedral import texel_cosines, texel_directions
+from bake_core.ray_log import ask_packet
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
 from bake_core.seen_lights import TEXELS_PER_LIGHT_SAMPLE, falls_into_texels, sample_lights
 from bake_core.tracer import Tracer
-from bake_core.transport import trace_path
+from bake_core.transport import trace_on
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -32,6 +34,8 @@ I64 = NDArray[np.int64]
 BLOCKS = 4
 # Paths a thread traces before it asks for more: a few hundred milliseconds' work.
 _CHUNK_PATHS = 1 << 18
+# Samples whose cosines are summed at once.
+_TOGETHER = 2
 
 
 @kernel
@@ -45,6 +49,84 @@ def _morton(row, column):  # type: ignore[no-untyped-def]
 
 # Of a half's samples, a scramble's.
 _of_scramble = kernel(of_scramble)
+
+
+@kernel
+def _through_texel(row, column, u, v, resolution):  # type: ignore[no-untyped-def]
+    """The unit direction through a point of a texel, and how many times longer the point's vector on the octahedron is than 1."""
+    a = (column + float(u)) * 2 / resolution - 1
+    b = (row + float(v)) * 2 / resolution - 1
+    c = 1 - abs(a) - abs(b)
+    fold = max(-c, 0.0)
+    a += -fold if a >= 0 else fold
+    b += -fold if b >= 0 else fold
+    length = math.sqrt(a * a + b * b + c * c)
+    return a / length, b / length, c / length, length
+
+
+@kernel
+def _add_cosines(normals, samples, own):  # type: ignore[no-untyped-def]
+    """Samples' light times their cosines about every normal, and the cosines alone; so many together that sums are fetched less often.
+
+    Parameters
+    ----------
+    samples : (_TOGETHER, 6) float32
+        Direction times solid angle, and light.
+    own : (4, m) float32, added to
+    """
+    ax, ay, az, ar, ag, ab = samples[0]
+    bx, by, bz, br, bg, bb = samples[1]
+    for i in range(normals.shape[1]):
+        f = max(normals[0, i] * ax + normals[1, i] * ay + normals[2, i] * az, np.float32(0))
+        g = max(normals[0, i] * bx + normals[1, i] * by + normals[2, i] * bz, np.float32(0))
+        own[0, i] += f * ar + g * br
+        own[1, i] += f * ag + g * bg
+        own[2, i] += f * ab + g * bb
+        own[3, i] += f + g
+
+
+class _Room(NamedTuple):
+    """What a thread works in.
+
+    Attributes
+    ----------
+    packet : Packet
+    ways : (LANES, 4) float64
+        Of its rays, as :func:`_through_texel` gives them.
+    waiting : (_TOGETHER, 6) float32
+        For :func:`_add_cosines`.
+    sums : (SCRAMBLES + 1, 4, m) float32
+        Of a texel, by scramble; the last is for light samples.
+    light : (HALVES, 3) float64
+        Of a texel, by half.
+    """
+
+    packet: Packet
+    ways: F64
+    waiting: F32
+    sums: F32
+    light: F64
+
+
+def _new_room(m: int) -> _Room:
+    sums = np.zeros((SCRAMBLES + 1, 4, m), np.float32)
+    return _Room(new_packet(), np.zeros((LANES, 4)), np.zeros((_TOGETHER, 6), np.float32), sums, np.zeros((HALVES, 3)))
+
+
+@kernel
+def _look_through(t, room, x, y, z, texel, resolution, key, spans, numbers):  # type: ignore[no-untyped-def]
+    """Ask for some of the rays of a probe through a texel together; they are numbered through both halves."""
+    row, column = texel // resolution, texel % resolution
+    first_span = spans[0, 1] - spans[0, 0]
+    for number in range(numbers[0], numbers[1]):
+        half = 0 if number < first_span else 1
+        point = spans[half, 0] + number - half * first_span
+        u, v = sobol_pair(reverse_bits(uint32(point)), mix64(key + uint64(texel * HALVES + half)))
+        lane = number - numbers[0]
+        way = room.ways[lane]
+        way[0], way[1], way[2], way[3] = _through_texel(row, column, u, v, resolution)
+        set_lane(room.packet, lane, x, y, z, way[0], way[1], way[2])
+    ask_packet(t, room.packet)
 
 
 @entry_kernel
@@ -64,8 +146,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
         Exact ∫ cosθ dω over each capture texel about each normal.
     blocks : (int, int)
         Half-open range out of BLOCKS.
-    room : (SCRAMBLES + 1, 4, m) float32, (HALVES, 3) float64
-        To work in.
+    room : _Room
     irradiance : (p, BLOCKS, SCRAMBLES, 3, m) float64, added to
         Σ L cosθ · (solid angle per sample), per block and scramble.
     radiance : (p, BLOCKS, HALVES, resolution², 3) float64 or (p, BLOCKS, HALVES, 0, 3), added to
@@ -74,8 +155,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
     Notes
     -----
     A point of the octahedral square stands for dω = dA / |v|³, v being its point on the octahedron |x| + |y| + |z| = 1: a face lies 1/√3
-    from
-    the centre and is √3 times its projection.
+    from the centre and is √3 times its projection.
 
     A texel's part of irradiance is ∫ L f, with f = cosθ dω/dA, over its area. F = ∫ f is known exactly, which makes f a control variate
     (Owen 2013, "Monte Carlo theory, methods and examples", section 8.9): scramble i estimates the texel's part as
@@ -90,7 +170,6 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
     cov(L, f).
     """
     ray_bits = ray.view(np.uint32)
-    lanes, light = room
     m = normals.shape[1]
     texels = resolution * resolution
     # Light samples a round: a round is one sample through every texel.
@@ -99,81 +178,76 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
     for p in range(positions.shape[0]):
         x0, y0, z0 = positions[p, 0], positions[p, 1], positions[p, 2]
         probe_key = mix64(seed ^ mix64(ids[p]))
+        first_span = spans[p, 0, 1] - spans[p, 0, 0]
+        both = first_span + spans[p, 1, 1] - spans[p, 1, 0]
         for texel in range(texels * blocks[0] // BLOCKS, texels * blocks[1] // BLOCKS):
             if cancelled[0]:
                 return CANCELLED
-            row, column = texel // resolution, texel % resolution
-            place = _morton(row, column)
+            place = _morton(texel // resolution, texel % resolution)
             block = texel * BLOCKS // texels
-            for half in range(HALVES):
-                light[half, 0] = light[half, 1] = light[half, 2] = 0.0
-                key = mix64(probe_key + uint64(texel * HALVES + half))
+            room.light[:] = 0.0
+            number = 0
+            for scramble in range(SCRAMBLES):
+                half, j = scramble // SCRAMBLES_PER_HALF, scramble % SCRAMBLES_PER_HALF
+                begun, end = spans[p, half, 0], spans[p, half, 1]
                 path_key = mix64(probe_key + uint64((texels + 1) * HALVES + half))
-                begun, span = spans[p, half, 0], spans[p, half, 1] - spans[p, half, 0]
-                sample = 0
-                for j in range(SCRAMBLES_PER_HALF):
-                    scramble = half * SCRAMBLES_PER_HALF + j
-                    own = lanes[scramble]
-                    for i in range(m):
-                        own[0, i] = own[1, i] = own[2, i] = own[3, i] = np.float32(0)
-                    for _ in range(_of_scramble(begun + span, j) - _of_scramble(begun, j)):
-                        # A half's scrambles share out the points of one sequence: each has a run of those of this pass.
-                        u, v = sobol_pair(reverse_bits(uint32(begun + sample)), key)
-                        # Bounces are stratified over the whole probe: one sequence for all its texels, of which a texel's samples of one
-                        # pass are a run, and neighbouring texels' runs follow one another.
-                        index = uint32(texels * begun + place * span + sample)
-                        reversed_index = reverse_bits(index)
-                        sample += 1
-                        a = (column + float(u)) * 2 / resolution - 1
-                        b = (row + float(v)) * 2 / resolution - 1
-                        c = 1 - abs(a) - abs(b)
-                        fold = max(-c, 0.0)
-                        a += -fold if a >= 0 else fold
-                        b += -fold if b >= 0 else fold
-                        length = math.sqrt(a * a + b * b + c * c)
-                        dx, dy, dz = a / length, b / length, c / length
-                        density = texels / 4 * (length * length * length)
-                        width = math.sqrt(1 / density)
-                        emitted, direct, indirect, _, light_pdf = trace_path(
-                            t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reversed_index, index, path_key, False, width, scramble
-                        )
-                        # What light samples find too, they find better: the balance heuristic leaves this sample its share.
-                        share = density / (density + light_rate * light_pdf)
-                        red = share * emitted[0] + direct[0] + indirect[0]
-                        green = share * emitted[1] + direct[1] + indirect[1]
-                        blue = share * emitted[2] + direct[2] + indirect[2]
-                        if radiance.shape[3]:
-                            rest = 0.0 if falls_into_texels(light_rate * light_pdf, density) else 1 - share
-                            radiance[p, block, half, texel, 0] += red + rest * emitted[0]
-                            radiance[p, block, half, texel, 1] += green + rest * emitted[1]
-                            radiance[p, block, half, texel, 2] += blue + rest * emitted[2]
-                        light[half, 0] += red
-                        light[half, 1] += green
-                        light[half, 2] += blue
-                        solid_angle = np.float32(1 / density)
-                        fr, fg, fb = np.float32(red), np.float32(green), np.float32(blue)
-                        fx, fy, fz = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
-                        for i in range(m):
-                            f = max(normals[0, i] * fx + normals[1, i] * fy + normals[2, i] * fz, np.float32(0))
-                            own[0, i] += f * fr
-                            own[1, i] += f * fg
-                            own[2, i] += f * fb
-                            own[3, i] += f
+                own, light = room.sums[scramble], room.light[half]
+                own[:] = np.float32(0)
+                # A half's scrambles share out the points of one sequence: each has a run of those of this pass.
+                count = _of_scramble(end, j) - _of_scramble(begun, j)
+                for i in range(count):
+                    lane = number % LANES
+                    if lane == 0:
+                        numbers = (number, min(number + LANES, both))
+                        _look_through(t, room, x0, y0, z0, texel, resolution, probe_key, spans[p], numbers)
+                    # Bounces are stratified over the whole probe: one sequence for all its texels, of which a texel's samples of one
+                    # pass are a run, and neighbouring texels' runs follow one another.
+                    index = uint32(texels * begun + place * (end - begun) + number - half * first_span)
+                    number += 1
+                    dx, dy, dz, length = room.ways[lane]
+                    density = texels / 4 * (length * length * length)
+                    width = math.sqrt(1 / density)
+                    take_lane(room.packet, lane, ray, ray_bits)
+                    emitted, direct, indirect, _, light_pdf = trace_on(
+                        t, ray, ray_bits, x0, y0, z0, dx, dy, dz, reverse_bits(index), index, path_key, False, width, scramble
+                    )
+                    # What light samples find too, they find better: the balance heuristic leaves this sample its share.
+                    share = density / (density + light_rate * light_pdf)
+                    red = share * emitted[0] + direct[0] + indirect[0]
+                    green = share * emitted[1] + direct[1] + indirect[1]
+                    blue = share * emitted[2] + direct[2] + indirect[2]
+                    if radiance.shape[3]:
+                        rest = 0.0 if falls_into_texels(light_rate * light_pdf, density) else 1 - share
+                        radiance[p, block, half, texel, 0] += red + rest * emitted[0]
+                        radiance[p, block, half, texel, 1] += green + rest * emitted[1]
+                        radiance[p, block, half, texel, 2] += blue + rest * emitted[2]
+                    light[0] += red
+                    light[1] += green
+                    light[2] += blue
+                    solid_angle = np.float32(1 / density)
+                    waits = room.waiting[i % _TOGETHER]
+                    waits[0], waits[1], waits[2] = np.float32(dx) * solid_angle, np.float32(dy) * solid_angle, np.float32(dz) * solid_angle
+                    waits[3], waits[4], waits[5] = red, green, blue
+                    if i % _TOGETHER == _TOGETHER - 1:
+                        _add_cosines(normals, room.waiting, own)
+                if count % _TOGETHER:
+                    room.waiting[count % _TOGETHER :] = np.float32(0)
+                    _add_cosines(normals, room.waiting, own)
             for half in range(HALVES):
                 other = HALVES - 1 - half
                 drawn = spans[p, other, 1] - spans[p, other, 0]
                 per = 1 / drawn if drawn > 0 else 0.0
                 mean_r, mean_g, mean_b = (
-                    np.float32(per * light[other, 0]),
-                    np.float32(per * light[other, 1]),
-                    np.float32(per * light[other, 2]),
+                    np.float32(per * room.light[other, 0]),
+                    np.float32(per * room.light[other, 1]),
+                    np.float32(per * room.light[other, 2]),
                 )
                 light_key = mix64(probe_key + uint64(texels * HALVES + half))
                 point = spans[p, half, 0]
                 for j in range(SCRAMBLES_PER_HALF):
                     scramble = half * SCRAMBLES_PER_HALF + j
                     count = _of_scramble(spans[p, half, 1], j) - _of_scramble(spans[p, half, 0], j)
-                    own, into = lanes[scramble], irradiance[p, block, scramble]
+                    own, into = room.sums[scramble], irradiance[p, block, scramble]
                     weight = np.float32(count)
                     for i in range(m):
                         missed = weight * cosines[texel, i] - own[3, i]
@@ -181,7 +255,7 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
                         into[1, i] += own[1, i] + mean_g * missed
                         into[2, i] += own[2, i] + mean_b * missed
                     if light_rate and texel % TEXELS_PER_LIGHT_SAMPLE == 0:
-                        rounds, spare, seen = (point, point + count), lanes[SCRAMBLES], radiance[p, block, half]
+                        rounds, spare, seen = (point, point + count), room.sums[SCRAMBLES], radiance[p, block, half]
                         at = (x0, y0, z0)
                         sample_lights(t, ray, ray_bits, at, texel, texels, rounds, light_rate, light_key, normals, spare, into, seen)
                     point += count
@@ -266,7 +340,7 @@ def capture_radiance(
             cosines,
             np.uint64(capture.seed),
             cancelled,
-            (np.zeros((SCRAMBLES + 1, 4, normals.shape[1]), np.float32), np.zeros((HALVES, 3))),
+            _new_room(normals.shape[1]),
             sums,
             seen,
         )

@@ -12,6 +12,7 @@ import platform
 import weakref
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import llvmlite.binding
 import numpy as np
@@ -27,8 +28,13 @@ from bake_core.scene import Scene
 #  instPrimID; 21-23 fill the structure up. Embree leaves them alone, so the number of rays is counted in the last two.
 RAYHIT_WORDS = 24
 _COUNT_LOW, _COUNT_HIGH = 22, 23
-# Rays are 16-byte aligned; a cache line keeps a ray from straddling two.
+# Rays are 16-byte aligned; a cache line keeps a ray from straddling two. A packet needs it.
 RAYHIT_ALIGNMENT = 64
+# RTCRayHit16: the same words, but for the last three, of so many rays side by side.
+LANES = 16
+_PACKET_WORDS = 21
+# What a hit leaves behind: its distance, u and v, and which triangle of which item it is.
+_HIT_WORDS = (8, 15, 16, 17, 18, 19)
 
 _TRIANGLE, _INSTANCE = 0, 121
 _BUFFER_INDEX, _BUFFER_VERTEX = 0, 1
@@ -37,10 +43,16 @@ _UINT3, _FLOAT3, _FLOAT3X4_ROW_MAJOR = 0x5003, 0x9003, 0x9134
 # none), and a sealed room is no longer dark.
 _SCENE_ROBUST = 1 << 2
 _QUALITY_MEDIUM = 1
+# RTCIntersectArguments begins with flags and a mask of features (all of them); after them come four pointers to nothing. Rays that start in
+# one point and part little are followed together; without the flag Embree follows each one by itself as soon as they part.
+_COHERENT = (1 << 16, 0xFFFFFFFF)
+_ARGUMENT_WORDS = 10
 
 _query = types.void(types.uintp, types.uintp, types.uintp)
 # (scene, RTCRayHit*, NULL): nearest hit. Kernels must be called through a Geometry, which registers the names first.
 intersect1 = types.ExternalFunction("rtcIntersect1", _query)
+# (int[16], scene, RTCRayHit16*, RTCIntersectArguments*): nearest hits of the rays of a packet for which the first is -1.
+intersect16 = types.ExternalFunction("rtcIntersect16", types.void(types.uintp, types.uintp, types.uintp, types.uintp))
 # (scene, RTCRay*, NULL): any hit; tfar becomes -inf where something is in the way.
 occluded1 = types.ExternalFunction("rtcOccluded1", _query)
 
@@ -78,7 +90,7 @@ def _library() -> ctypes.CDLL:
     ):
         function = getattr(lib, name)
         function.restype, function.argtypes = result, arguments
-    for name in ("rtcIntersect1", "rtcOccluded1"):
+    for name in ("rtcIntersect1", "rtcIntersect16", "rtcOccluded1"):
         llvmlite.binding.add_symbol(name, ctypes.cast(getattr(lib, name), p).value)
     return lib
 
@@ -99,9 +111,39 @@ def instruction_set() -> str:
 
 def new_rayhit() -> NDArray[np.float32]:
     """An aligned RTCRayHit to be filled by a kernel: (24,) float32."""
-    raw = np.zeros(RAYHIT_WORDS * 4 + RAYHIT_ALIGNMENT, np.uint8)
+    return _aligned(RAYHIT_WORDS).view(np.float32)
+
+
+class Packet(NamedTuple):
+    """Rays that a kernel asks for together.
+
+    Attributes
+    ----------
+    rays : (_PACKET_WORDS, LANES) float32, and the same as uint32
+        An aligned RTCRayHit16.
+    valid : (LANES,) int32
+        -1 for the rays that there are, else 0.
+    arguments : (_ARGUMENT_WORDS,) uint32
+        RTCIntersectArguments.
+    """
+
+    rays: NDArray[np.float32]
+    bits: NDArray[np.uint32]
+    valid: NDArray[np.int32]
+    arguments: NDArray[np.uint32]
+
+
+def new_packet() -> Packet:
+    """A packet to be filled by a kernel with rays that stay together."""
+    bits, arguments = _aligned(_PACKET_WORDS * LANES).reshape(_PACKET_WORDS, LANES), _aligned(_ARGUMENT_WORDS)
+    arguments[: len(_COHERENT)] = _COHERENT
+    return Packet(bits.view(np.float32), bits, _aligned(LANES).view(np.int32), arguments)
+
+
+def _aligned(words: int) -> NDArray[np.uint32]:
+    raw = np.zeros(words * 4 + RAYHIT_ALIGNMENT, np.uint8)
     start = -raw.ctypes.data % RAYHIT_ALIGNMENT
-    return raw[start : start + RAYHIT_WORDS * 4].view(np.float32)
+    return raw[start : start + words * 4].view(np.uint32)
 
 
 def rays_traced(ray: NDArray[np.float32]) -> int:
@@ -124,6 +166,29 @@ def set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, tfar):  # type: ignore[no-unt
     ray_bits[_COUNT_LOW] += np.uint32(1)
     if ray_bits[_COUNT_LOW] == 0:
         ray_bits[_COUNT_HIGH] += np.uint32(1)
+
+
+@kernel
+def set_lane(packet, lane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Fill one ray of a packet, without an end; it is counted when it is taken out."""
+    rays, bits = packet.rays, packet.bits
+    rays[0, lane], rays[1, lane], rays[2, lane], rays[3, lane] = ox, oy, oz, np.float32(0)
+    rays[4, lane], rays[5, lane], rays[6, lane], rays[7, lane] = dx, dy, dz, np.float32(0)
+    rays[8, lane] = np.float32(np.inf)
+    bits[9, lane] = np.uint32(0xFFFFFFFF)
+    bits[10, lane] = bits[11, lane] = np.uint32(0)
+    bits[18, lane] = bits[19, lane] = np.uint32(0xFFFFFFFF)
+    packet.valid[lane] = -1
+
+
+@kernel
+def take_lane(packet, lane, ray, ray_bits):  # type: ignore[no-untyped-def]
+    """A ray and its hit out of a packet, as if it had been asked for alone."""
+    rays = packet.rays
+    set_ray(ray, ray_bits, rays[0, lane], rays[1, lane], rays[2, lane], rays[4, lane], rays[5, lane], rays[6, lane], rays[8, lane])
+    for word in _HIT_WORDS:
+        ray_bits[word] = packet.bits[word, lane]
+    packet.valid[lane] = 0
 
 
 class Geometry:

@@ -27,6 +27,8 @@ _PARTS = 3
 # Bits of a cell's number along one axis.
 AXIS_BITS = 17
 AXIS_CELLS = 1 << AXIS_BITS
+# As far above or below a plane, of the height of a cell's middle, a point may be and count as in it.
+_FLAT = 1 / 64
 # An empty place in the table.
 NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
 
@@ -43,8 +45,9 @@ class LightCache(NamedTuple):
     table : (2^k, 2) uint64
         A hash table with linear probing (Knuth 1998, "The Art of Computer Programming" 3, section 6.4): :func:`cell_key`, or NONE where
         it is empty, and the row of the cell.
-    middle : (n, 3) float64
-        A point above each cell's surface, local frame: whoever does not see it is not answered.
+    middle : (n, 4) float64
+        A point above each cell's surface, local frame: whoever does not see it is not answered. And how high it is above the plane that
+        sees it from all over the cell: whoever is in that plane need not ask. 0 where there is none.
     light : (n, SCRAMBLES, 3) float32
         By scramble, ∫ L cosθ dω / π over what next-event estimation leaves of it, its share by the balance heuristic.
     """
@@ -57,7 +60,7 @@ class LightCache(NamedTuple):
 
 def empty_cache(scrambles: int) -> LightCache:
     """A cache that knows nothing."""
-    return LightCache(np.zeros(8), np.full((1, 2), NONE), np.zeros((0, 3)), np.zeros((0, scrambles, 3), np.float32))
+    return LightCache(np.zeros(8), np.full((1, 2), NONE), np.zeros((0, 4)), np.zeros((0, scrambles, 3), np.float32))
 
 
 @kernel
@@ -112,6 +115,13 @@ def sees_middle(t, ray, ray_bits, p, n, epsilon, middle):  # type: ignore[no-unt
     return not blocked(t, ray, ray_bits, x, y, z, middle[0] - x, middle[1] - y, middle[2] - z, np.float32(1))
 
 
+@kernel
+def in_open_plane(p, n, middle):  # type: ignore[no-untyped-def]
+    """Whether a point lies in the plane that sees the middle of its cell."""
+    above = (middle[0] - p[0]) * n[0] + (middle[1] - p[1]) * n[1] + (middle[2] - p[2]) * n[2]
+    return abs(above - middle[3]) < _FLAT * middle[3]
+
+
 def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon, d2):  # type: ignore[no-untyped-def]
     c = t.cache
     if c.grid[5] <= depth <= c.grid[6]:
@@ -119,10 +129,11 @@ def _cached(t, ray, ray_bits, scramble, depth, p, n, epsilon, d2):  # type: igno
         way = facing(n[3], n[4], n[5])
         for level in range(int(c.grid[4]) if within else 0):
             place, found = find(c.table, cell_key(i, j, k, way, level))
-            near = c.grid[7] * c.grid[3] * 2.0**level
+            near = c.grid[7] * c.grid[3] * (1 << level)
             if found and d2 >= near * near:
                 cell = c.table[place, 1]
-                if sees_middle(t, ray, ray_bits, p, n, epsilon, c.middle[cell]):
+                middle = c.middle[cell]
+                if in_open_plane(p, n, middle) or sees_middle(t, ray, ray_bits, p, n, epsilon, middle):
                     light = c.light[cell, scramble]
                     return True, np.float64(light[0]), np.float64(light[1]), np.float64(light[2])
     return False, 0.0, 0.0, 0.0

@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.embree import intersect1, new_rayhit, occluded1, set_ray
+from bake_core.embree import LANES, intersect1, intersect16, new_packet, new_rayhit, occluded1, set_lane, set_ray
 from bake_core.kernels import either, entry_kernel, kernel
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 
-NEAREST, ANY = 0, 1
+# The first ray of a packet, and the others of it, all for their nearest hits; else rays are asked for alone.
+NEAREST, ANY, FIRST_OF_PACKET, OF_PACKET = 0, 1, 2, 3
 
 
 class RayLog(NamedTuple):
@@ -26,7 +27,7 @@ class RayLog(NamedTuple):
     rays : (n, 8) float32
         Origin, near end, direction, far end: the words 0 to 6 and 8 of an RTCRay before the query.
     kinds : (n,) uint8
-        :data:`NEAREST` or :data:`ANY`.
+        :data:`NEAREST`, :data:`ANY`, :data:`FIRST_OF_PACKET` or :data:`OF_PACKET`.
     found : (n,) float32
         The word 8 after it: the distance of the hit, or -inf where something is in the way; else the far end as it was.
     asked : (1,) int64
@@ -46,7 +47,7 @@ def new_log(size: int) -> RayLog:
 
 @kernel
 def _write_down(log, ray, kind):  # type: ignore[no-untyped-def]
-    """Note a ray before it is asked for; its place in the log, -1 where that is full."""
+    """Note a ray's words before it is asked for; its place in the log, -1 where that is full."""
     i = log.asked[0]
     log.asked[0] += 1
     if i >= log.rays.shape[0]:
@@ -80,17 +81,48 @@ def _any_logged(t, ray):  # type: ignore[no-untyped-def]
         t.log.found[i] = ray[8]
 
 
-# The nearest hit of the ray in an RTCRayHit that `set_ray` has filled, and whether anything is in its way.
+def _packet(t, packet):  # type: ignore[no-untyped-def]
+    intersect16(packet.valid.ctypes.data, t.handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+
+
+def _packet_logged(t, packet):  # type: ignore[no-untyped-def]
+    first = -1
+    for lane in range(LANES):
+        if packet.valid[lane]:
+            i = _write_down(t.log, packet.rays[:, lane], OF_PACKET if first >= 0 else FIRST_OF_PACKET)
+            first = i if first < 0 else first
+    intersect16(packet.valid.ctypes.data, t.handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+    for lane in range(LANES):
+        if packet.valid[lane] and 0 <= first < t.log.found.shape[0]:
+            t.log.found[first] = packet.rays[8, lane]
+            first += 1
+
+
+# The nearest hits of the rays in a packet, and of the ray in an RTCRayHit that `set_ray` has filled, and whether anything is in its way.
+ask_packet = either("log")(_packet_logged)(_packet)
 ask_nearest = either("log")(_nearest_logged)(_nearest)
 ask_any = either("log")(_any_logged)(_any)
 
 
 @entry_kernel
-def _replay(handle, ray, rays, kinds, found):  # type: ignore[no-untyped-def]
+def _replay(handle, ray, packet, rays, kinds, found):  # type: ignore[no-untyped-def]
     """Ask again; `found` is filled as the log's."""
     ray_bits = ray.view(np.uint32)
-    for i in range(rays.shape[0]):
+    i = 0
+    while i < rays.shape[0]:
         r = rays[i]
+        if kinds[i] >= FIRST_OF_PACKET:
+            lanes = 0
+            while lanes < LANES and i + lanes < rays.shape[0] and kinds[i + lanes] == (OF_PACKET if lanes else FIRST_OF_PACKET):
+                r = rays[i + lanes]
+                set_lane(packet, lanes, r[0], r[1], r[2], r[4], r[5], r[6])
+                lanes += 1
+            intersect16(packet.valid.ctypes.data, handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+            for lane in range(lanes):
+                found[i + lane] = packet.rays[8, lane]
+                packet.valid[lane] = 0
+            i += lanes
+            continue
         set_ray(ray, ray_bits, r[0], r[1], r[2], r[4], r[5], r[6], r[7])
         ray[3] = r[3]
         if kinds[i] == NEAREST:
@@ -98,11 +130,12 @@ def _replay(handle, ray, rays, kinds, found):  # type: ignore[no-untyped-def]
         else:
             occluded1(handle, ray.ctypes.data, 0)
         found[i] = ray[8]
+        i += 1
     return 0
 
 
 def replay(handle: np.uint64, rays: F32, kinds: U8, *, threads: int = 1) -> F32:
-    """Ask Embree for logged rays, with nothing in between: the least time that a tracer which asks them one by one can take.
+    """Ask Embree for logged rays, with nothing in between: the least time that a tracer which asks them the same way can take.
 
     Parameters
     ----------
@@ -111,7 +144,7 @@ def replay(handle: np.uint64, rays: F32, kinds: U8, *, threads: int = 1) -> F32:
     rays : (n, 8) float32
     kinds : (n,) uint8
     threads : int
-        Each takes a run of them.
+        Each takes a run of them, of whole packets.
 
     Returns
     -------
@@ -119,11 +152,12 @@ def replay(handle: np.uint64, rays: F32, kinds: U8, *, threads: int = 1) -> F32:
         As :attr:`RayLog.found`.
     """
     found = np.empty(len(rays), np.float32)
-    cuts = np.linspace(0, len(rays), threads + 1).astype(np.int64)
+    whole = np.append(np.flatnonzero(kinds != OF_PACKET), len(rays))
+    cuts = whole[np.linspace(0, len(whole) - 1, threads + 1).astype(np.int64)]
 
     def some(part: int) -> None:
         among = slice(cuts[part], cuts[part + 1])
-        _replay(handle, new_rayhit(), rays[among], kinds[among], found[among])
+        _replay(handle, new_rayhit(), new_packet(), rays[among], kinds[among], found[among])
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(some, range(threads)))

@@ -156,7 +156,8 @@ def _irradiance_kernel(t, ray, stands, first, samples, seed, cancelled, out):  #
                     green += g
                     blue += b
                 # Of no width: a look-up in a texture that is as fine as it can be is no estimate of what a wider one would have found.
-                r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, epsilon, reversed_index, index, key, False, 0)
+                u, v = sobol_pair(reversed_index, key)
+                r, g, b = trace_by_cosine(t, ray, ray_bits, p, n, epsilon, u, v, reversed_index, index, key, False, 0)
                 red += r
                 green += g
                 blue += b

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bake_core.allocation import FIRST_SAMPLES, HALVES, SCRAMBLES
 from bake_core.cache_cells import FEWEST, average, codes
+from bake_core.cache_guide import FEWEST_POINTS, GROUP_BYTES, Guide
 from bake_core.cache_points import Points, find_points, gather_light
 from bake_core.light_cache import AXIS_CELLS, LightCache, empty_cache
 from bake_core.spec import Spec
@@ -41,10 +42,14 @@ FEWEST_PROBES = 64
 # Of what probes see, this much must be in the cache for it to pay.
 _COVERED = 0.5
 # A point twice, while cells are made of it; a cell with its place in the table, in all sizes together.
-_POINT_BYTES, _LIGHT_BYTES, _CELL_BYTES = 2 * 90, 2 * 24, 4 * (SCRAMBLES * 12 + 24 + 32) // 3
+_POINT_BYTES, _LIGHT_BYTES, _CELL_BYTES = 2 * 90, 2 * 24, 4 * (SCRAMBLES * 12 + 32 + 32) // 3
 _SEED = 0x11C4C3E5
-# What makes a point's paths of each layer other ones.
-_LAYER_KEYS = np.random.default_rng(_SEED).integers(1 << 64, size=_MOST_LAYERS, dtype=np.uint64)
+# What the guide takes of a point of the first stage, while it hears of its paths.
+_GUIDE_BYTES = 9 * _PATHS + GROUP_BYTES // FEWEST_POINTS
+# Cells about which it is learnt where light comes from are so many sizes larger than the smallest.
+_GUIDE_LEVEL = 3
+# What makes a point's paths other ones in each layer, and once they are guided by what those of the first stage found.
+_KEYS = np.random.default_rng(_SEED).integers(1 << 64, size=(2, _MOST_LAYERS), dtype=np.uint64)
 
 
 @dataclass(eq=False)
@@ -59,6 +64,8 @@ class SurfaceLight:
     below knows, as a sweep of a radiosity solution does (Cohen and Wallace 1993, "Radiosity and Realistic Image Synthesis", section 5.3).
     Where bounces are limited, a layer knows light of so many of them, and the highest, of one less than a path may have, is what the
     bake reads. Where they are not, there are two of the same light, and from the second stage on the one before is the lower one.
+
+    Half of all paths go where those of the first stage before them found light (:mod:`bake_core.cache_guide`).
 
     ``dataclasses.replace`` makes one of another seed or tracer, that has learnt nothing yet.
 
@@ -139,8 +146,8 @@ class SurfaceLight:
 
     def bytes(self, samples: int) -> int:
         """What is held at most, once so many samples have been taken."""
-        points = self.probes * SCRAMBLES * self.rounds(_stage(samples))
-        return points * (_POINT_BYTES + len(self._bounces) * _LIGHT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
+        first, points = (self.probes * SCRAMBLES * self.rounds(stage) for stage in (0, _stage(samples)))
+        return first * _GUIDE_BYTES + points * (_POINT_BYTES + len(self._bounces) * _LIGHT_BYTES + _CELL_BYTES // (HALVES * FEWEST))
 
     def blank(self) -> Tracer:
         """The tracer with a cache that knows nothing: for kernels that are to be compiled, and who starts to learn."""
@@ -150,7 +157,8 @@ class SurfaceLight:
         """Compile, or fetch from the cache on disk, the kernels that learn: from no point."""
         never, points = np.zeros(1, np.uint8), Points.none()
         find_points(self.tracer, self._positions, (0, 0), self._seed, threads=1, cancelled=never)
-        gather_light(self.blank(), points, (0, 1), threads=1, cancelled=never)
+        nobody = np.zeros(0, np.int64)
+        gather_light(self.blank(), points, self._guide, nobody, (0, 1), keep=False, threads=1, cancelled=never)
         average(self.tracer, points, 1, self._grid(0), threads=1)
 
     def forget(self) -> None:
@@ -158,6 +166,7 @@ class SurfaceLight:
         self._learnt, self._points, self._cached = -1, Points.none(), self.blank()
         self._light = [np.zeros((0, 3)) for _ in self._bounces]
         self._rays: list[int] = []
+        self._guide = Guide.of(np.zeros(0, np.uint64))
 
     @property
     def _bounces(self) -> list[int]:
@@ -175,16 +184,22 @@ class SurfaceLight:
         # Without limits the last stage knows of the same light, and better than a lower layer would.
         lowest = 1 if stage and not self._limited else 0
         light, known = [*self._light], self._cached if lowest else self.blank()
+        about = codes(self._grid(0), points) >> np.uint64(3 * _GUIDE_LEVEL)
+        guide = self._guide if stage else Guide.of(about)
+        rows = guide.rows(about)
         for layer in range(lowest, len(bounces)):
             teacher = _teaching(known, bounces[layer])
             light[layer] = np.concatenate([self._light[layer], np.zeros((len(points) - old, 3))])
-            of_layer = replace(points, key=points.key ^ _LAYER_KEYS[layer], light=light[layer])
+            of_layer = replace(points, key=points.key ^ _KEYS[min(stage, 1), layer], light=light[layer])
             paths = self.paths(stage, layer)
             for part, first in ((slice(old), self.paths(stage - 1, layer) if stage else 0), (slice(old, None), 0)):
-                rays += gather_light(teacher, of_layer[part], (first, paths), threads=threads, cancelled=cancelled)
+                more, guide = gather_light(
+                    teacher, of_layer[part], guide, rows[part], (first, paths), keep=not stage, threads=threads, cancelled=cancelled
+                )
+                rays += more
             cache, traced = average(self.tracer, of_layer, paths, grid, threads=threads)
             known, rays = _with(self.tracer, cache), rays + traced
-        self._learnt, self._points, self._light, self._cached = stage, points, light, known
+        self._learnt, self._points, self._light, self._cached, self._guide = stage, points, light, known, guide
         self._rays.append(rays)
 
     def rounds(self, stage: int) -> int:

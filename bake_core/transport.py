@@ -45,13 +45,21 @@ def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-d
 
 @kernel
 def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble):  # type: ignore[no-untyped-def]
-    """One path.
+    """One path."""
+    set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, INFINITE)
+    ask_nearest(t, ray)
+    return trace_on(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble)
+
+
+@kernel
+def trace_on(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble):  # type: ignore[no-untyped-def]
+    """One path, of whose ray it is known what it meets.
 
     Parameters
     ----------
     t : Tables
     ray, ray_bits : (24,) float32, the same as uint32
-        An aligned RTCRayHit to work in.
+        An aligned RTCRayHit with the ray's hit, to work in.
     ox … dz : float
         The ray, local frame; unit direction.
     reversed_index, index, key
@@ -96,17 +104,7 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
     shines = has_sky(t) or t.environment[0] + t.environment[1] + t.environment[2] > 0
     look = no_gloss(t)
     needs_choice = t.emitters.cdf.shape[0] > 1 or t.lights.cdf.shape[0] > 1
-    # Where the ray goes on from, behind what it has passed through.
-    x, y, z = ox, oy, oz
     while True:
-        if depth > 0 and depth >= t.max_bounces and not has_emitters:
-            # The last ray can only find the environment: whether anything is in the way is a cheaper question than what.
-            if not shines or blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, INFINITE):
-                break
-            ray_bits[18] = INVALID
-        else:
-            set_ray(ray, ray_bits, x, y, z, dx, dy, dz, INFINITE)
-            ask_nearest(t, ray)
         if ray_bits[18] == INVALID:
             # No light is drawn from a constant environment: cosine sampling is already its importance sampling.
             radiance, sky_pdf = environment_radiance(t, dx, dy, dz)
@@ -127,6 +125,8 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
         if passed < MAX_PASSED and ((behind and camera and depth == 0) or lets_through(t, material, triangle, b1, b2, ray_bits)):
             # Go on from the far side: the normal looks back at us.
             x, y, z = p[0] - epsilon * n[0], p[1] - epsilon * n[1], p[2] - epsilon * n[2]
+            set_ray(ray, ray_bits, x, y, z, dx, dy, dz, INFINITE)
+            ask_nearest(t, ray)
             passed += 1
             continue
         hit_any = hit_any or depth == 0
@@ -230,13 +230,20 @@ def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, 
             pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
         spread = scattered_spread(t, spread, pdf)
         ox, oy, oz = p[0] + epsilon * n[0], p[1] + epsilon * n[1], p[2] + epsilon * n[2]
-        x, y, z = ox, oy, oz
         passed = 0
+        if depth >= t.max_bounces and not has_emitters:
+            # The last ray can only find the environment: whether anything is in the way is a cheaper question than what.
+            if not shines or blocked(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, INFINITE):
+                break
+            ray_bits[18] = INVALID
+        else:
+            set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, INFINITE)
+            ask_nearest(t, ray)
     return (emitted_r, emitted_g, emitted_b), (direct_r, direct_g, direct_b), (indirect_r, indirect_g, indirect_b), hit_any, light_pdf
 
 
 @kernel
-def trace_by_cosine(t, ray, ray_bits, p, n, epsilon, reversed_index, index, key, wide, scramble):  # type: ignore[no-untyped-def]
+def trace_by_cosine(t, ray, ray_bits, p, n, epsilon, u, v, reversed_index, index, key, wide, scramble):  # type: ignore[no-untyped-def]
     """One path that leaves a matt surface: what the next ray brings beside :mod:`bake_core.next_event`, an estimate of ∫ L cosθ dω / π.
 
     Parameters
@@ -244,12 +251,13 @@ def trace_by_cosine(t, ray, ray_bits, p, n, epsilon, reversed_index, index, key,
     p : 3 float64
     n : 6 float64
         Geometric and shading normal.
+    u, v : float32
+        What its direction is drawn by.
     wide : bool
         Whether the ray stands for as much as its density says, as one does that was scattered here; else textures are as fine as can be.
 
     Other parameters are :func:`trace_path`'s; what the ray meets has the share that the balance heuristic gives it.
     """
-    u, v = sobol_pair(reversed_index, key)
     dx, dy, dz = sample_lambert(u, v, n)
     pdf = lambert_cosine(dx, dy, dz, n) * INV_PI
     spread = scattered_spread(t, 0.0, pdf) if wide else 0.0

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bake_core.bench.throughput import logging_tracer, trace_once
 from bake_core.examples import cornell
 from bake_core.prepared import Prepared, prepare
-from bake_core.ray_log import ANY, NEAREST, RayLog, coherent_order, new_log, replay
+from bake_core.ray_log import ANY, FIRST_OF_PACKET, NEAREST, OF_PACKET, RayLog, coherent_order, new_log, replay
 from bake_core.spec import parse_spec
 from tests.scenes import load_example
 
@@ -27,12 +27,15 @@ def test_embree_answers_logged_rays_as_it_did() -> None:
     _, counted = traced(probes, 0)
     prepared, log = traced(probes, int(counted.asked[0]))
     assert log.asked[0] == counted.asked[0] > 8 * 4 * 4 * 16
-    assert {NEAREST, ANY} == set(log.kinds.tolist())
+    assert {NEAREST, ANY, FIRST_OF_PACKET, OF_PACKET} == set(log.kinds.tolist())
     for threads in (1, 3):
         np.testing.assert_array_equal(replay(prepared.tracer.tables.handle, log.rays, log.kinds, threads=threads), log.found)
+    # A packet's rays find what they find alone.
+    alone = np.where(log.kinds == ANY, ANY, NEAREST).astype(np.uint8)
+    np.testing.assert_array_equal(replay(prepared.tracer.tables.handle, log.rays, alone), log.found)
     # The first ray is a probe's own.
     np.testing.assert_allclose(log.rays[0, :3], prepared.positions[0], rtol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(log.rays[log.kinds == NEAREST, 4:7], axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(log.rays[log.kinds != ANY, 4:7], axis=1), 1, rtol=1e-6)
 
 
 def test_a_full_log_counts_on() -> None:
