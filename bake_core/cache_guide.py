@@ -23,7 +23,7 @@ U64 = NDArray[np.uint64]
 # Parts along either side of the square that directions are drawn from.
 PARTS = 8
 # Fewer points of one group have too few paths to tell.
-FEWEST_POINTS = 8
+FEWEST_POINTS = 16
 # What a group takes in memory: two sums for each part, and the table.
 GROUP_BYTES = (2 * 8 + 4) * PARTS * (PARTS + 1)
 # The share of paths that goes where light came from.
@@ -61,12 +61,11 @@ class Guide(NamedTuple):
         row[row == len(self.group)] = 0
         return np.where(self.group[row] == codes, row, -1) if len(self.group) else np.full(len(codes), -1)
 
-    def heard(self, rows: I64, part: NDArray[np.uint8], brought: F32) -> Self:
-        """The same and what paths brought: points' groups (n,); the part of each path (n, paths), and what is summed (n, paths, 2)."""
-        known = rows >= 0
-        place = (rows[known, None] * PARTS * PARTS + part[known]).ravel()
-        square, paths = (np.bincount(place, brought[known, :, i].ravel(), self.square.size).reshape(self.square.shape) for i in (0, 1))
-        return type(self)(self.group, self.square + square, self.paths + paths)
+    def hear(self, heard: tuple[I64, F64]) -> None:
+        """Add what :func:`sums` tells of some paths."""
+        place, (square, paths) = heard
+        self.square.reshape(-1)[place] += square
+        self.paths.reshape(-1)[place] += paths
 
     def table(self) -> F32:
         """What :func:`guided` reads, (g, PARTS, PARTS + 1) float32: running sums of chances, of a row's parts and, last, of the rows."""
@@ -82,6 +81,23 @@ class Guide(NamedTuple):
         table[:, :, -2] = 1
         table[:, -1, -1] = 1
         return np.ascontiguousarray(table)
+
+
+def sums(rows: I64, part: NDArray[np.uint8], brought: F32) -> tuple[I64, F64]:
+    """What paths brought, by place in a guide's sums: (k,), and (2, k).
+
+    Parameters
+    ----------
+    rows : (n,) int64
+        Of the points that they are from.
+    part : (n, paths) uint8
+        Of each path.
+    brought : (n, paths, 2) float32
+        The square of what it brought, and one, over its density.
+    """
+    known = rows >= 0
+    place, which = np.unique(rows[known, None] * (PARTS * PARTS) + part[known], return_inverse=True)
+    return place, np.stack([np.bincount(which.ravel(), brought[known, :, i].ravel(), len(place)) for i in (0, 1)])
 
 
 @kernel

@@ -7,7 +7,7 @@ after another of one sequence; a path that meets what an earlier cache knows end
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Self
@@ -17,7 +17,7 @@ from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from bake_core.allocation import SCRAMBLES
-from bake_core.cache_guide import PARTS, Guide, guided
+from bake_core.cache_guide import PARTS, Guide, guided, sums
 from bake_core.embree import new_rayhit, rays_traced
 from bake_core.errors import Cancelled
 from bake_core.kernels import CANCELLED, DONE, entry_kernel
@@ -129,7 +129,7 @@ def _gather_kernel(t, ray, place, key, scramble, guide, row, first_path, paths, 
         Each point's in the guide; below 0 where it has none.
     light : (n, 3) float64, added to
     part, brought : (n, paths) uint8 and (n, paths, 2) float32, or (n, 0) and (n, 0, 2)
-        As :meth:`bake_core.cache_guide.Guide.heard` takes them.
+        As :func:`bake_core.cache_guide.sums` takes them.
     """
     ray_bits = ray.view(np.uint32)
     for i in range(place.shape[0]):
@@ -195,7 +195,7 @@ def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: i
         wanted = (positions, first, rounds[0], each, np.uint64(seed))
         return int(_points_kernel(tracer.tables, ray, *wanted, cancelled, place[part], way[part], key[part]))
 
-    rays = _on_threads(some, range(0, max(n, 1), _CHUNK), threads)
+    rays = sum(traced for _, traced in _on_threads(some, range(0, max(n, 1), _CHUNK), threads))
     suited = way < _UNSUITED
     scramble = (np.arange(n) // each % SCRAMBLES).astype(np.uint8)
     points = Points(place[suited], way[suited], key[suited], scramble[suited], np.zeros((int(suited.sum()), 3)))
@@ -203,8 +203,8 @@ def find_points(tracer: Tracer, positions: F64, rounds: tuple[int, int], seed: i
 
 
 def gather_light(
-    tracer: Tracer, points: Points, guide: Guide, rows: I64, paths: tuple[int, int], *, keep: bool, threads: int, cancelled: Flag
-) -> tuple[int, Guide]:
+    tracer: Tracer, points: Points, guide: Guide, rows: I64, paths: tuple[int, int], *, teach: bool, threads: int, cancelled: Flag
+) -> int:
     """Add what paths bring to every point's light; the same bits for any number of threads.
 
     Parameters
@@ -217,15 +217,13 @@ def gather_light(
         Each point's in it.
     paths : (int, int)
         Half-open range of paths from each point.
-    keep : bool
-        Whether the guide shall know of them.
+    teach : bool
+        Whether the guide hears of them, once all are traced that were sent by it.
 
     Returns
     -------
     int
         Rays that it took.
-    Guide
-        The one that there was, or what it knows now.
 
     Raises
     ------
@@ -233,20 +231,26 @@ def gather_light(
     """
     count = paths[1] - paths[0]
     step = max(_CHUNK_PATHS // max(count, 1), 1)
-    table, kept = guide.table(), (len(points), count if keep else 0)
-    part, brought = np.zeros(kept, np.uint8), np.zeros((*kept, 2), np.float32)
+    table, heard = guide.table(), {}
 
     def some(ray: F32, first: int) -> int:
         at = slice(first, first + step)
+        kept = (len(rows[at]), count if teach else 0)
+        part, brought = np.zeros(kept, np.uint8), np.zeros((*kept, 2), np.float32)
         asked = (points.place[at], points.key[at], points.scramble[at], table, rows[at], paths[0], count)
-        return int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[at], part[at], brought[at]))
+        status = int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[at], part, brought))
+        heard[first] = sums(rows[at], part, brought)
+        return status
 
-    rays = _on_threads(some, range(0, max(len(points), 1), step), threads)
-    return rays, guide.heard(rows, part, brought) if keep else guide
+    rays = 0
+    for first, traced in _on_threads(some, range(0, max(len(points), 1), step), threads):
+        rays += traced
+        guide.hear(heard.pop(first))
+    return rays
 
 
-def _on_threads(some: Callable[[F32, int], int], firsts: range, threads: int) -> int:
-    """Run a kernel for each of some beginnings; how many rays that took."""
+def _on_threads(some: Callable[[F32, int], int], firsts: range, threads: int) -> Iterator[tuple[int, int]]:
+    """Run a kernel for each of some beginnings: these in their order, and how many rays each took."""
 
     def run(first: int) -> int:
         ray = new_rayhit()
@@ -255,4 +259,4 @@ def _on_threads(some: Callable[[F32, int], int], firsts: range, threads: int) ->
         return rays_traced(ray)
 
     with ThreadPoolExecutor(threads) as pool:
-        return sum(pool.map(run, firsts))
+        yield from zip(firsts, pool.map(run, firsts), strict=True)

@@ -44,8 +44,8 @@ _COVERED = 0.5
 # A point twice, while cells are made of it; a cell with its place in the table, in all sizes together.
 _POINT_BYTES, _LIGHT_BYTES, _CELL_BYTES = 2 * 90, 2 * 24, 4 * (SCRAMBLES * 12 + 32 + 32) // 3
 _SEED = 0x11C4C3E5
-# What the guide takes of a point of the first stage, while it hears of its paths.
-_GUIDE_BYTES = 9 * _PATHS + GROUP_BYTES // FEWEST_POINTS
+# What the guide takes, over the points of the first stage.
+_GUIDE_BYTES = GROUP_BYTES // FEWEST_POINTS
 # Cells about which it is learnt where light comes from are so many sizes larger than the smallest.
 _GUIDE_LEVEL = 3
 # What makes a point's paths other ones in each layer, and once they are guided by what those of the first stage found.
@@ -158,7 +158,7 @@ class SurfaceLight:
         never, points = np.zeros(1, np.uint8), Points.none()
         find_points(self.tracer, self._positions, (0, 0), self._seed, threads=1, cancelled=never)
         nobody = np.zeros(0, np.int64)
-        gather_light(self.blank(), points, self._guide, nobody, (0, 1), keep=False, threads=1, cancelled=never)
+        gather_light(self.blank(), points, self._guide, nobody, (0, 1), teach=False, threads=1, cancelled=never)
         average(self.tracer, points, 1, self._grid(0), threads=1)
 
     def forget(self) -> None:
@@ -193,10 +193,8 @@ class SurfaceLight:
             of_layer = replace(points, key=points.key ^ _KEYS[min(stage, 1), layer], light=light[layer])
             paths = self.paths(stage, layer)
             for part, first in ((slice(old), self.paths(stage - 1, layer) if stage else 0), (slice(old, None), 0)):
-                more, guide = gather_light(
-                    teacher, of_layer[part], guide, rows[part], (first, paths), keep=not stage, threads=threads, cancelled=cancelled
-                )
-                rays += more
+                asked = (of_layer[part], guide, rows[part], (first, paths))
+                rays += gather_light(teacher, *asked, teach=not stage, threads=threads, cancelled=cancelled)
             cache, traced = average(self.tracer, of_layer, paths, grid, threads=threads)
             known, rays = _with(self.tracer, cache), rays + traced
         self._learnt, self._points, self._light, self._cached, self._guide = stage, points, light, known, guide

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.cache_guide import FEWEST_POINTS, PARTS, Guide, guided
+from bake_core.cache_guide import FEWEST_POINTS, PARTS, Guide, guided, sums
 from bake_core.kernels import entry_kernel
 
 Rows = NDArray[np.int64]
@@ -35,7 +35,8 @@ def of_one(square: NDArray[np.float64], paths: float = 100) -> Guide:
     guide = Guide.of(np.zeros(FEWEST_POINTS, np.uint64))
     part = np.arange(PARTS * PARTS, dtype=np.uint8)[None]
     brought = np.stack([paths * square.ravel(), np.full(PARTS * PARTS, paths)], 1).astype(np.float32)[None]
-    return guide.heard(guide.rows(np.zeros(1, np.uint64)), part, brought)
+    guide.hear(sums(guide.rows(np.zeros(1, np.uint64)), part, brought))
+    return guide
 
 
 def test_who_knows_nothing_or_the_same_everywhere_changes_nothing() -> None:
@@ -81,9 +82,8 @@ def test_groups_hear_only_of_their_own_points_and_strangers_have_none() -> None:
     np.testing.assert_array_equal(rows, [0, 2, -1, 1, -1])
     part = np.full((5, 2), 3, np.uint8)
     brought = np.arange(20, dtype=np.float32).reshape(5, 2, 2)
-    heard = guide.heard(rows, part, brought)
-    np.testing.assert_array_equal(heard.square[:, 3], [0 + 2, 12 + 14, 4 + 6])
-    np.testing.assert_array_equal(heard.paths[:, 3], [1 + 3, 13 + 15, 5 + 7])
-    assert heard.square.sum() == heard.square[:, 3].sum()
-    assert not guide.square.any()
+    guide.hear(sums(rows, part, brought))
+    np.testing.assert_array_equal(guide.square[:, 3], [0 + 2, 12 + 14, 4 + 6])
+    np.testing.assert_array_equal(guide.paths[:, 3], [1 + 3, 13 + 15, 5 + 7])
+    assert guide.square.sum() == guide.square[:, 3].sum()
     assert (Guide.of(np.zeros(0, np.uint64)).rows(codes) == -1).all()
