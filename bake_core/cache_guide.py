@@ -22,7 +22,7 @@ U64 = NDArray[np.uint64]
 
 # Parts along either side of the square that directions are drawn from.
 PARTS = 8
-# Fewer points of one group have too few paths to tell.
+# Fewer points of one group have too few paths to tell of.
 FEWEST_POINTS = 16
 # What a group takes in memory: two sums for each part, and the table.
 GROUP_BYTES = (2 * 8 + 4) * PARTS * (PARTS + 1)
@@ -83,7 +83,7 @@ class Guide(NamedTuple):
         return np.ascontiguousarray(table)
 
 
-def sums(rows: I64, part: NDArray[np.uint8], brought: F32) -> tuple[I64, F64]:
+def sums(rows: I64, part: NDArray[np.uint8], brought: F64) -> tuple[I64, F64]:
     """What paths brought, by place in a guide's sums: (k,), and (2, k).
 
     Parameters
@@ -92,8 +92,8 @@ def sums(rows: I64, part: NDArray[np.uint8], brought: F32) -> tuple[I64, F64]:
         Of the points that they are from.
     part : (n, paths) uint8
         Of each path.
-    brought : (n, paths, 2) float32
-        The square of what it brought, and one, over its density.
+    brought : (n, paths, 2) float64
+        The square of what it brought, and one, over its density. Squares of float32's largest and smallest radiances are none in float32.
     """
     known = rows >= 0
     place, which = np.unique(rows[known, None] * (PARTS * PARTS) + part[known], return_inverse=True)

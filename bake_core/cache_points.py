@@ -128,7 +128,7 @@ def _gather_kernel(t, ray, place, key, scramble, guide, row, first_path, paths, 
     row : (n,) int64
         Each point's in the guide; below 0 where it has none.
     light : (n, 3) float64, added to
-    part, brought : (n, paths) uint8 and (n, paths, 2) float32, or (n, 0) and (n, 0, 2)
+    part, brought : (n, paths) uint8 and (n, paths, 2) float64, or (n, 0) and (n, 0, 2)
         As :func:`bake_core.cache_guide.sums` takes them.
     """
     ray_bits = ray.view(np.uint32)
@@ -236,7 +236,7 @@ def gather_light(
     def some(ray: F32, first: int) -> int:
         at = slice(first, first + step)
         kept = (len(rows[at]), count if teach else 0)
-        part, brought = np.zeros(kept, np.uint8), np.zeros((*kept, 2), np.float32)
+        part, brought = np.zeros(kept, np.uint8), np.zeros((*kept, 2))
         asked = (points.place[at], points.key[at], points.scramble[at], table, rows[at], paths[0], count)
         status = int(_gather_kernel(tracer.tables, ray, *asked, cancelled, points.light[at], part, brought))
         heard[first] = sums(rows[at], part, brought)

@@ -45,7 +45,7 @@ def sample_pair(reversed_index, index, depth, key):  # type: ignore[no-untyped-d
 
 @kernel
 def trace_path(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble):  # type: ignore[no-untyped-def]
-    """One path."""
+    """One path, of whose ray nothing is known; parameters and what it returns are :func:`trace_on`'s."""
     set_ray(ray, ray_bits, ox, oy, oz, dx, dy, dz, INFINITE)
     ask_nearest(t, ray)
     return trace_on(t, ray, ray_bits, ox, oy, oz, dx, dy, dz, reversed_index, index, key, camera, spread, scramble)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from bake_core.cache_guide import FEWEST_POINTS, PARTS, Guide, guided, sums
@@ -34,7 +35,7 @@ def of_one(square: NDArray[np.float64], paths: float = 100) -> Guide:
     """A guide of one group, all of whose parts have had so many paths, with these mean squares."""
     guide = Guide.of(np.zeros(FEWEST_POINTS, np.uint64))
     part = np.arange(PARTS * PARTS, dtype=np.uint8)[None]
-    brought = np.stack([paths * square.ravel(), np.full(PARTS * PARTS, paths)], 1).astype(np.float32)[None]
+    brought = np.stack([paths * square.ravel(), np.full(PARTS * PARTS, paths)], 1)[None]
     guide.hear(sums(guide.rows(np.zeros(1, np.uint64)), part, brought))
     return guide
 
@@ -45,6 +46,13 @@ def test_who_knows_nothing_or_the_same_everywhere_changes_nothing() -> None:
         out = drawn(guide, points)
         np.testing.assert_allclose(out[:, :2], points, atol=2e-6)
         np.testing.assert_allclose(out[:, 2], 1, rtol=2e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-76, 1e76])
+def test_the_brightest_and_the_faintest_light_are_guided_alike(scale: float) -> None:
+    """Squares of radiances about 1e-38 and 1e38."""
+    square = np.random.default_rng(4).random((PARTS, PARTS))
+    np.testing.assert_allclose(of_one(scale * square).table(), of_one(square).table(), rtol=1e-6)
 
 
 def test_any_function_has_the_same_integral_and_a_patch_of_light_less_noise() -> None:
@@ -81,7 +89,7 @@ def test_groups_hear_only_of_their_own_points_and_strangers_have_none() -> None:
     rows = guide.rows(np.array([4, 9, 5, 7, 11], np.uint64))
     np.testing.assert_array_equal(rows, [0, 2, -1, 1, -1])
     part = np.full((5, 2), 3, np.uint8)
-    brought = np.arange(20, dtype=np.float32).reshape(5, 2, 2)
+    brought = np.arange(20.0).reshape(5, 2, 2)
     guide.hear(sums(rows, part, brought))
     np.testing.assert_array_equal(guide.square[:, 3], [0 + 2, 12 + 14, 4 + 6])
     np.testing.assert_array_equal(guide.paths[:, 3], [1 + 3, 13 + 15, 5 + 7])
