@@ -29,7 +29,7 @@ from tests.pavilion import SKY, pavilion_spec, write_pavilion
 from tests.service.running import Server, box_spec, busy, cancel_to_idle, environment, free_port, living, octobake, wait_for
 
 # Some 5 s of work for two cores, half of it in the last pass: long enough to be interrupted in the middle.
-SAMPLES = 256
+SAMPLES = 512
 WORK: dict[str, Any] = {"probes": (5, 3, 3), "stop": {"target_error": None, "max_samples": SAMPLES}}
 # Much is committed by then.
 SHORT_SHARDS = ("--shard-seconds", "0.2")
