@@ -20,7 +20,7 @@ from bake_core.scene import Camera, Lights, Scene
 from bake_core.scene_buffers import light_buffer, material_buffers, mesh_buffers
 from bake_core.shader_compiler import compile_glsl, shader_text
 from bake_core.shadow_views import NEAR, Batch, batches, corners, view_matrices
-from bake_core.textures import TextureTable
+from bake_core.texture_tables import TextureTable
 from bake_core.volume_chains import traceable
 from bake_core.vulkan import Bindings, Buffer, Commands, Device, Image, color_target, depth_target, graphics_pipeline, storage
 

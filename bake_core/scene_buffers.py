@@ -12,7 +12,7 @@ from bake_core.ggx_albedo import albedo_table
 from bake_core.lights import cone_ramps
 from bake_core.scene import Lights, Scene
 from bake_core.shadow_views import Batch
-from bake_core.textures import TextureTable
+from bake_core.texture_tables import TextureTable
 from bake_core.vulkan import Buffer, Device, Draw, Image, storage, texture
 
 F32 = NDArray[np.float32]

@@ -18,7 +18,8 @@ from bake_core.materials import MaterialTable, gloss_table, material_table
 from bake_core.ray_log import RayLog
 from bake_core.scene import Lights, Scene
 from bake_core.spec import Spec
-from bake_core.textures import TextureTable, emits_unevenly, mean_emission, texture_table
+from bake_core.texture_tables import TextureTable, texture_table
+from bake_core.textures import emits_unevenly, mean_emission
 
 
 class Tables(NamedTuple):

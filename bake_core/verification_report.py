@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bake_core.comparison import LUMINANCE
 from bake_core.images import write_exr, write_png
-from bake_core.textures import linear_to_srgb
+from bake_core.texture_tables import linear_to_srgb
 
 F32 = NDArray[np.float32]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bake_core.gltf.writer import GlbWriter, Part
 from bake_core.octahedral import texel_directions
-from bake_core.textures import srgb_to_linear
+from bake_core.texture_tables import srgb_to_linear
 from tests.baking import bake_example, maps
 from tests.pictures import png
 

@@ -18,7 +18,7 @@ from bake_core.picture import Picture, path_trace_picture
 from bake_core.raster import PIXEL_SAMPLES, Rasterizer
 from bake_core.scene import Camera, Scene
 from bake_core.spec import Spec, parse_spec
-from bake_core.textures import texture_table
+from bake_core.texture_tables import texture_table
 from bake_core.tracer import Tracer
 from bake_core.vulkan import Device
 from tests.baking import THREADS

@@ -24,7 +24,7 @@ from bake_core.progress import Progress
 from bake_core.raster import Rasterizer
 from bake_core.scene import Scene
 from bake_core.spec import parse_spec
-from bake_core.textures import texture_table
+from bake_core.texture_tables import texture_table
 from bake_core.thresholds import Thresholds, load_thresholds
 from bake_core.verification import verify
 from bake_core.vulkan import Device

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from bake_core.gltf.writer import CLAMP, MIRRORED, REPEAT, GlbWriter, Part
 from bake_core.kernels import entry_kernel
 from bake_core.scene import Image, Scene
-from bake_core.textures import TextureTable, linear_to_srgb, look_up, pyramid, sample_alpha, sample_texture, srgb_to_linear, texture_table
+from bake_core.texture_tables import TextureTable, linear_to_srgb, pyramid, srgb_to_linear, texture_table
+from bake_core.textures import look_up, sample_alpha, sample_texture
 from tests.pictures import png
 from tests.unit.gltf_build import load_glb
 
