@@ -21,7 +21,7 @@ from bake_core.kernels import CANCELLED, DONE, entry_kernel, kernel
 from bake_core.octahedral import texel_cosines, texel_directions
 from bake_core.ray_log import ask_packet
 from bake_core.sampling import mix64, reverse_bits, sobol_pair
-from bake_core.seen_lights import TEXELS_PER_LIGHT_SAMPLE, falls_into_texels, sample_lights
+from bake_core.seen_lights import TEXELS_PER_LIGHT_SAMPLE, capture_density, falls_into_texels, sample_lights
 from bake_core.tracer import Tracer
 from bake_core.transport import trace_on
 
@@ -53,7 +53,7 @@ _of_scramble = kernel(of_scramble)
 
 @kernel
 def _through_texel(row, column, u, v, resolution):  # type: ignore[no-untyped-def]
-    """The unit direction through a point of a texel, and how many times longer the point's vector on the octahedron is than 1."""
+    """The unit direction through a point of a texel."""
     a = (column + float(u)) * 2 / resolution - 1
     b = (row + float(v)) * 2 / resolution - 1
     c = 1 - abs(a) - abs(b)
@@ -61,7 +61,7 @@ def _through_texel(row, column, u, v, resolution):  # type: ignore[no-untyped-de
     a += -fold if a >= 0 else fold
     b += -fold if b >= 0 else fold
     length = math.sqrt(a * a + b * b + c * c)
-    return a / length, b / length, c / length, length
+    return a / length, b / length, c / length
 
 
 @kernel
@@ -91,8 +91,8 @@ class _Room(NamedTuple):
     Attributes
     ----------
     packet : Packet
-    ways : (LANES, 4) float64
-        Of its rays, as :func:`_through_texel` gives them.
+    ways : (LANES, 3) float64
+        Directions of its rays, which has them in float32.
     waiting : (_TOGETHER, 6) float32
         For :func:`_add_cosines`.
     sums : (SCRAMBLES + 1, 4, m) float32
@@ -110,7 +110,7 @@ class _Room(NamedTuple):
 
 def _new_room(m: int) -> _Room:
     sums = np.zeros((SCRAMBLES + 1, 4, m), np.float32)
-    return _Room(new_packet(), np.zeros((LANES, 4)), np.zeros((_TOGETHER, 6), np.float32), sums, np.zeros((HALVES, 3)))
+    return _Room(new_packet(), np.zeros((LANES, 3)), np.zeros((_TOGETHER, 6), np.float32), sums, np.zeros((HALVES, 3)))
 
 
 @kernel
@@ -124,7 +124,7 @@ def _look_through(t, room, x, y, z, texel, resolution, key, spans, numbers):  # 
         u, v = sobol_pair(reverse_bits(uint32(point)), mix64(key + uint64(texel * HALVES + half)))
         lane = number - numbers[0]
         way = room.ways[lane]
-        way[0], way[1], way[2], way[3] = _through_texel(row, column, u, v, resolution)
+        way[0], way[1], way[2] = _through_texel(row, column, u, v, resolution)
         set_lane(room.packet, lane, x, y, z, way[0], way[1], way[2])
     ask_packet(t, room.packet)
 
@@ -204,8 +204,8 @@ def _capture_kernel(t, ray, positions, ids, spans, resolution, blocks, normals, 
                     # pass are a run, and neighbouring texels' runs follow one another.
                     index = uint32(texels * begun + place * (end - begun) + number - half * first_span)
                     number += 1
-                    dx, dy, dz, length = room.ways[lane]
-                    density = texels / 4 * (length * length * length)
+                    dx, dy, dz = room.ways[lane]
+                    density = capture_density((dx, dy, dz), texels)
                     width = math.sqrt(1 / density)
                     take_lane(room.packet, lane, ray, ray_bits)
                     emitted, direct, indirect, _, light_pdf = trace_on(

@@ -52,7 +52,7 @@ _query = types.void(types.uintp, types.uintp, types.uintp)
 # (scene, RTCRayHit*, NULL): nearest hit. Kernels must be called through a Geometry, which registers the names first.
 intersect1 = types.ExternalFunction("rtcIntersect1", _query)
 # (int[16], scene, RTCRayHit16*, RTCIntersectArguments*): nearest hits of the rays of a packet for which the first is -1.
-intersect16 = types.ExternalFunction("rtcIntersect16", types.void(types.uintp, types.uintp, types.uintp, types.uintp))
+_intersect16 = types.ExternalFunction("rtcIntersect16", types.void(types.uintp, types.uintp, types.uintp, types.uintp))
 # (scene, RTCRay*, NULL): any hit; tfar becomes -inf where something is in the way.
 occluded1 = types.ExternalFunction("rtcOccluded1", _query)
 
@@ -179,6 +179,12 @@ def set_lane(packet, lane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-d
     bits[10, lane] = bits[11, lane] = np.uint32(0)
     bits[18, lane] = bits[19, lane] = np.uint32(0xFFFFFFFF)
     packet.valid[lane] = -1
+
+
+@kernel
+def intersect_packet(handle, packet):  # type: ignore[no-untyped-def]
+    """Nearest hits of the rays that a packet has."""
+    _intersect16(packet.valid.ctypes.data, handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
 
 
 @kernel

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bake_core.embree import LANES, intersect1, intersect16, new_packet, new_rayhit, occluded1, set_lane, set_ray
+from bake_core.embree import LANES, intersect1, intersect_packet, new_packet, new_rayhit, occluded1, set_lane, set_ray
 from bake_core.kernels import either, entry_kernel, kernel
 
 F32 = NDArray[np.float32]
@@ -82,7 +82,7 @@ def _any_logged(t, ray):  # type: ignore[no-untyped-def]
 
 
 def _packet(t, packet):  # type: ignore[no-untyped-def]
-    intersect16(packet.valid.ctypes.data, t.handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+    intersect_packet(t.handle, packet)
 
 
 def _packet_logged(t, packet):  # type: ignore[no-untyped-def]
@@ -91,7 +91,7 @@ def _packet_logged(t, packet):  # type: ignore[no-untyped-def]
         if packet.valid[lane]:
             i = _write_down(t.log, packet.rays[:, lane], OF_PACKET if first >= 0 else FIRST_OF_PACKET)
             first = i if first < 0 else first
-    intersect16(packet.valid.ctypes.data, t.handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+    intersect_packet(t.handle, packet)
     for lane in range(LANES):
         if packet.valid[lane] and 0 <= first < t.log.found.shape[0]:
             t.log.found[first] = packet.rays[8, lane]
@@ -117,7 +117,7 @@ def _replay(handle, ray, packet, rays, kinds, found):  # type: ignore[no-untyped
                 r = rays[i + lanes]
                 set_lane(packet, lanes, r[0], r[1], r[2], r[4], r[5], r[6])
                 lanes += 1
-            intersect16(packet.valid.ctypes.data, handle, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+            intersect_packet(handle, packet)
             for lane in range(lanes):
                 found[i + lane] = packet.rays[8, lane]
                 packet.valid[lane] = 0

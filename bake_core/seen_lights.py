@@ -37,7 +37,7 @@ def _add_light(gain, radiance, d, normals, lanes):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _capture_density(d, texels):  # type: ignore[no-untyped-def]
+def capture_density(d, texels):  # type: ignore[no-untyped-def]
     """Of capture rays in a unit direction, a round; its 1-norm takes it onto the octahedron."""
     reach = 1 / (abs(d[0]) + abs(d[1]) + abs(d[2]))
     return texels / 4 * (reach * reach * reach)
@@ -64,7 +64,7 @@ def falls_into_texels(rate, density):  # type: ignore[no-untyped-def]
 @kernel
 def _add_sample(radiance, d, pdf, texels, rate, normals, lanes, seen):  # type: ignore[no-untyped-def]
     """Light that was drawn in a direction, into irradiance and into the capture texel there; the balance heuristic's share of it."""
-    density = _capture_density(d, texels)
+    density = capture_density(d, texels)
     gain = 1 / (density + rate * pdf)
     _add_light(gain, radiance, d, normals, lanes)
     if seen.shape[0] and falls_into_texels(rate * pdf, density):

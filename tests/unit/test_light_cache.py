@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bake_core.allocation import SCRAMBLES, Allocation
+from bake_core.allocation import SCRAMBLES, Allocation, uniform
 from bake_core.bake import empty_state
 from bake_core.cache_cells import codes
 from bake_core.cache_points import Points
+from bake_core.capture import Capture, capture_radiance
 from bake_core.errors import Cancelled
 from bake_core.examples import box_sides, closed_box, cornell, quads_part, two_rooms
 from bake_core.gltf.writer import GlbWriter
@@ -24,7 +25,7 @@ from bake_core.shards import trace_shard
 from bake_core.spec import parse_spec
 from bake_core.surface_light import SurfaceLight
 from tests.baking import prepared, traced
-from tests.scenes import add_square, load
+from tests.scenes import add_square, load, load_example
 
 Array = NDArray[Any]
 # Of a box from -1 to 1.
@@ -77,6 +78,44 @@ def test_a_closed_box_has_the_closed_form_s_light(bounces: int | None) -> None:
     assert p.light is not None
     expected = math.pi * emission * (1 - (albedo ** (bounces + 1) if bounces else 0)) / (1 - albedo)
     assert traced(p).mean().mean() == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("power", [-80, 80])
+def test_the_brightest_and_the_faintest_light_is_learnt_alike(power: int) -> None:
+    """Light times a power of two is the same bits, though its squares, by which paths are guided, are beyond float32."""
+    glb, document = two_rooms()
+    scene, spec = load_example(glb), parse_spec({**document, "integrator": "cache"})
+    scaled = replace(scene, materials=replace(scene.materials, emission=scene.materials.emission * np.float32(2.0**power)))
+    plain, other = (traced(prepare(s, spec, threads=2)).mean() for s in (scene, scaled))
+    assert plain.max() > 0
+    np.testing.assert_array_equal(other * 2.0**-power, plain)
+
+
+def test_open_cells_answer_as_if_they_were_asked() -> None:
+    """A cell that is open is read without a ray: the same bits as with one, and most of a room's cells are."""
+    p = prepared(cornell(), integrator="cache", volumes=[_IN_CORNELL])
+    assert p.light is not None
+    known = p.light.known(16, threads=2, cancelled=np.zeros(1, np.uint8))
+    cache = known.tables.cache
+    assert cache is not None and (cache.middle[:, 3] > 0).mean() > 0.5
+    asking = cache._replace(middle=np.where([True, True, True, False], cache.middle, 0.0))
+    rays, sums = [], []
+    for some in (cache, asking):
+        tracer = replace(known, tables=known.tables._replace(cache=some))
+        irradiance, _, count = capture_radiance(
+            tracer,
+            p.positions,
+            np.arange(p.probe_count, dtype=np.uint64),
+            uniform(p.probe_count, (0, 16)),
+            Capture(16, 8, 0, keep_radiance=False),
+            threads=2,
+            cancelled=np.zeros(1, np.uint8),
+            advance=lambda _: None,
+        )
+        rays.append(count)
+        sums.append(irradiance)
+    np.testing.assert_array_equal(sums[0], sums[1])
+    assert rays[0] < 0.85 * rays[1]
 
 
 def test_it_differs_from_paths_by_what_both_state() -> None:
